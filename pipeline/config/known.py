@@ -22,7 +22,7 @@ NOTHING = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """How a PV answers to an input, an MV or a measured disturbance, as far as somebody knows.
+    """How ``pv`` answers to ``input``, an MV or a measured disturbance, as far as somebody knows.
 
     ``sign`` of its steady gain, of an integrating PV that of its slope; ``none``: the input does not move it. ``gain``:
     the steady gain lies from .. to [PV/input]. ``dead_s``: the dead time lies from .. to [s]. What is left out is not

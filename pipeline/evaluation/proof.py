@@ -12,9 +12,11 @@ from pipeline.evaluation.validation import Statement
 MISSED = 0.5  # of a PV's motion beyond the noise: a model that misses more explains the lesser part of it
 SHARE = 0.8  # free-run error over the PV's deviation, noise and all: a model that has more hardly needs its inputs
 FORESEEN = 10.0  # nats: odds of 20,000 to 1 for a model whose MVs move the PV
+COUPLED = 0.25  # of the model's own worth, that integral action of several loops keeps whatever open answers are
 LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
 BY_REGION = ("turns", "fades")  # verdicts on answers that hold by the regions of the MV's range
 FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
+LITTLE = "the record leaves its sign open; beside the other answers it decides nothing, and all loops stand either"
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
     "`loopwright new` lists them in step_test.csv, and give these rows too"
@@ -128,9 +130,10 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
         limit = "certain in sign in each region where it is not small, and of the size that one-step predictions find"
         because = _by_regions_why(found, shown=shown, holds=holds)
     else:
-        holds = _holds(found, known, shown=foreseen)
+        little = not known and _matters_little(found, proof, shown=shown)
+        holds = little or _holds(found, known, shown=foreseen)
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
-        because = _word(found, known, holds=holds) or _why(pv, mv, found)
+        because = LITTLE if little else _word(found, known, holds=holds) or _why(pv, mv, found)
     return Statement(
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         limit,
@@ -138,6 +141,12 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
         holds,
         because,
     )
+
+
+def _matters_little(found: Mapping[str, Any], proof: Mapping[str, Any], *, shown: bool) -> bool:
+    """Whether an uncertain answer of several loops may be what it will: the PV ``shown``, the others hold the plant."""
+    margin = proof.get("sign_margin")
+    return shown and found["verdict"] == "uncertain" and margin is not None and margin >= COUPLED
 
 
 def _measured(found: Mapping[str, Any]) -> str:

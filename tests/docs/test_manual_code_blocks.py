@@ -24,6 +24,7 @@ from stated import assert_stated
 
 from pipeline.commands import COMMANDS
 from pipeline.config.exports import ExportParams
+from pipeline.config.known import Known
 from pipeline.config.params import CaseParams, ControllerParams, ModelParams, RecordParams, parse
 from pipeline.excitation import EXCITATIONS
 from pipeline.laws import LAWS
@@ -154,7 +155,10 @@ def test_yaml_is_what_params_yaml_takes(block: Block) -> None:
         return
     tree = yaml.safe_load(block.text)
     readers = {"exports": ExportParams, "cases": CaseParams, "models": ModelParams}
-    assert set(tree) <= {*readers, "records", "controllers"}, block.where
+    assert set(tree) <= {*readers, "records", "controllers", "plants"}, block.where
+    for entry in tree.pop("plants", {}).values():  # a part of a section, whose signals `new` writes
+        assert set(entry) == {"known"}, block.where
+        assert all(parse(Known, one, block.where) for one in entry["known"])
     for section, entries in tree.items():
         for name, entry in entries.items():
             if section in readers:

@@ -71,6 +71,20 @@ UNCERTAIN = {"verdict": "uncertain", "direct": 1.0, "sd": 0.5}
 
 
 @pytest.mark.parametrize(
+    ("margin", "nats", "verdict", "ships"),
+    [(0.6, 50.0, "uncertain", True), (0.2, 50.0, "uncertain", False), (None, 50.0, "uncertain", False),
+     (0.6, 9.9, "uncertain", False), (0.6, 50.0, "opposite", False)],
+)  # fmt: skip
+def test_an_uncertain_answer_that_all_loops_stand_either_way_refuses_no_controller(
+    margin: float | None, nats: float, verdict: str, ships: bool
+) -> None:
+    """Where the inputs foresee the PV, and the record contradicts nothing."""
+    found = in_closed_loop(nats, verdict=verdict, direct=0.1, sd=0.5)
+    found[""]["parts"]["identified"]["per_seed"]["0"]["proof"]["sign_margin"] = margin
+    assert (sign_doubts(found) == "") is ships
+
+
+@pytest.mark.parametrize(
     ("nats", "answer", "ships"),
     [
         (50.0, {}, True),  # two standard deviations, and all models of one sign

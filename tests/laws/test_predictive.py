@@ -399,9 +399,31 @@ def test_the_search_takes_what_costs_least() -> None:
     assert len({tuple(c.numbers.values()) for c in tried}) == len(tried)
 
 
-def test_of_numbers_that_cost_nearly_the_same_the_calmest_are_taken() -> None:
-    made = [Candidate({}, cost, travel=travel) for cost, travel in ((1.0, 3.0), (1.04, 1.0), (1.049, 2.0), (1.06, 0.1))]
+def test_of_numbers_that_err_nearly_the_same_the_calmest_are_taken() -> None:
+    """Their travel counts once, by its size, and not in the limit."""
+    rows = ((1.0, 3.0), (1.015, 1.0), (1.019, 2.0), (1.03, 0.1))
+    made = [Candidate({}, error + TRAVEL * travel, travel=travel) for error, travel in rows]
+    assert [c.error for c in made] == pytest.approx([error for error, _ in rows])
     assert calmest(made) is made[1]
+
+
+def test_the_loads_of_a_record_go_on_in_the_loops() -> None:
+    """From nothing, elsewhere in each loop, beside steps at the MVs; without a record nothing of it is there."""
+    model, moves = first_order(), 0.01 * np.random.default_rng(0).normal(size=(3_000, 1))
+    known = Identified.from_arrays(
+        {**model.config(), "recorded": len(moves)},
+        {name: value.numpy() for name, value in model.state_dict().items()} | {"load_moves": moves},
+    )
+    plain, drawn = (Trials.draw(of, made_signals(), 15, seed=0) for of in (model, known))
+    load, quiet = drawn.load[..., 0].numpy(), drawn.quiet
+    assert not plain.load[:, :LOOPS].any()
+    assert not load[:quiet].any()
+    for i in range(LOOPS):
+        assert np.ptp(load[quiet:, i]) > 0
+        rows = np.diff(load[quiet:, i])
+        assert any(np.allclose(rows, moves[at + 1 : at + 1 + len(rows), 0]) for at in range(3_000 - len(rows)))
+    assert len({float(of[-1]) for of in load.T[:LOOPS]}) == LOOPS
+    np.testing.assert_array_equal(plain.bias.numpy(), drawn.bias.numpy())
 
 
 @pytest.mark.parametrize(

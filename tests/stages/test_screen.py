@@ -344,6 +344,15 @@ def test_how_fast_an_mv_may_move_makes_the_laws_anew_and_not_the_models() -> Non
     assert changed == {"design", "validate", "report"}
 
 
+def test_what_is_known_of_a_pair_makes_the_models_anew_and_not_the_record() -> None:
+    stages = ("screen", "fit", "design", "report")
+    before = {stage: listing(Path.cwd(), stage, "tank") for stage in stages}
+    plant = yaml.safe_load(Path("params.yaml").read_text())["plants"]["tank"]
+    pair = {"pv": plant["pv"][0]["name"], "input": plant["mv"][0]["name"]}
+    edited(lambda tree: tree["plants"]["tank"].update(known=[{**pair, "sign": "+"}]))
+    assert {stage for stage in stages if listing(Path.cwd(), stage, "tank") != before[stage]} == {*stages[1:]}
+
+
 def test_what_was_learnt_from_a_screened_record_descends_from_it() -> None:
     folder = RECORD.parent.as_posix()
     made = StageResult("screen@tank", "", {"work/code/screen-tank.json": "0"}, {}, {folder: "1.dir"})

@@ -102,6 +102,9 @@ class Trials:
                 load[:, LOOPS + i, :n_cv] = LOAD / horizon * course[:, i, :n_cv]
             else:
                 bias[:, LOOPS + i] = BIAS * half * course[:, i, :n_mv]
+        if model.recorded:
+            own = [*range(LOOPS), *(LOOPS + i for i in AT_OUTPUT if i in WALKS)]
+            load[:, own] = _replayed(model, n, horizon, len(own))
         colour = model.colour.numpy()
         sd = deviation((model.noise * model.y_scale).numpy(), colour)
         noise = sd * coloured(rng.normal(size=(n, loops, model.n_y)), colour)
@@ -195,6 +198,15 @@ def _courses(rng: np.random.Generator, horizon: int, hold: int, count: int) -> A
     course = np.repeat(steps, hold, axis=0)
     course[:, WALKS] = np.clip(np.cumsum(DRIFT * rng.normal(size=course[:, WALKS].shape), axis=0), -1, 1)
     return np.concatenate([np.zeros((horizon, LOOPS, count)), course])
+
+
+def _replayed(model: Identified, n: int, quiet: int, loops: int) -> Array:
+    """Loads (n, loops, n_y), scaled, as the record's went on, from nothing after ``quiet`` samples, each elsewhere."""
+    moves = model.load_moves.numpy()
+    late = max(len(moves) - (n - quiet), 0)
+    rows = np.linspace(0, late, loops).astype(int)[None, :] + np.arange(n - quiet)[:, None]
+    course = np.cumsum(moves[rows % len(moves)], axis=0)  # (n - quiet, loops, n_y)
+    return np.concatenate([np.zeros((quiet, loops, model.n_y)), course])
 
 
 def _rests(model: Identified, mv: Array, rng: np.random.Generator) -> tuple[Tensor, Tensor]:

@@ -54,8 +54,8 @@ def assembled(
 ) -> Identified:
     """The finished model of fitted ``model`` under inputs late by ``delays`` (n_v,).
 
-    ``known`` are its scaled ``noise`` (n_y,), the noise's ``colour`` and what the record leaves open: ``gain_sd``,
-    ``pace_sd``, ``dead_sd``.
+    ``known`` are its scaled ``noise`` (n_y,), the noise's ``colour``, the ``load_moves`` (n, n_y) of the record, and
+    what the record leaves open: ``gain_sd``, ``pace_sd``, ``dead_sd``.
     """
     whole, n_y, n_v = remembering(model, delays), data.y.shape[1], data.v.shape[1]
     table, covariance = rest_map(model, data.y, data.v, seed)
@@ -64,6 +64,7 @@ def assembled(
     rest[:n], rest_cov[:n, :n] = table, covariance
     rest[n:, n_y : n_y + n_v] = np.repeat(np.eye(n_v), delays, axis=0)
     config = {"n_y": n_y, "n_mv": n_mv, "n_dv": n_v - n_mv, "n_x": total, "n_hidden": model.n_hidden}
+    config["recorded"] = len(known["load_moves"])
     arrays = {
         **{name: getattr(whole, name) for name in ("a", "b", "c", "w1", "b1", "w2")},
         **{name: getattr(scales, name) for name in ("y_center", "y_scale", "v_center", "v_scale")},

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.errors import ModelError
 from pipeline.models.identified.drift import error_beyond_drift
 from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.innovations import Innovations, PredictionError, begun, with_loads
+from pipeline.models.identified.innovations import Innovations, PredictionError, begun, innovations, with_loads
 from pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
 from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
 from pipeline.models.identified.output_error import (
@@ -245,6 +245,8 @@ def _with_noise_on_all_rows(problem: Problem, structure: Structure, fitted: Fitt
             model = begun(replace(plant, c=-plant.b @ rows.v.mean(axis=0)), whole)
         except ModelError:  # all rows together show no stable response, though a fold did
             return fitted
+    if innovations(model, whole) is None:  # its fold's rows it followed
+        return fitted
     for iterations in (15, 4):
         fitter = PredictionError(iterations=iterations, ridge=structure.ridge)
         found = fitter.fit(model, whole, gain_alone=structure.noise == "gain")
@@ -266,8 +268,10 @@ def within_limits(problem: Problem, structure: Structure, fitted: Fitted) -> Fit
         plant = model.plant
         a = model.a.copy()
         a[: plant.n_x, : plant.n_x] = within_unit_circle(plant.a, 1 - 1e-9)
-        fitter = PredictionError(iterations=5)
-        return fitter.fit(replace(model, a=a), problem.whole(structure), gain_alone=True)
+        whole, inner = problem.whole(structure), replace(model, a=a)
+        if innovations(inner, whole) is None:  # the gain was that of another plant
+            inner = begun(inner.plant, whole)
+        return PredictionError(iterations=5).fit(inner, whole, gain_alone=True)
     inside = replace(model, a=within_unit_circle(model.a, 1 - 1e-9))
     again = OutputError(iterations=5, correction=structure.correction)
     return again.fit(inside, problem.whole(structure), free=inside.mask(b=True, c=True))

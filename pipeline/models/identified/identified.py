@@ -28,6 +28,8 @@ class Identified(Model):
     each MV and ``pace_sd`` of the time constant are relative, ``dead_sd`` counts periods: what the record leaves open.
     ``rest`` gives the state of a rest from [y scaled, v scaled, 1], ``rest_cov`` the covariance of its error. ``dead``
     holds, for each MV, the fewest whole periods that pass before any output answers (0: the next sample does).
+    ``load_moves`` are changes of the loads from row to row over ``recorded`` rows of a record in closed loop, 0 of
+    another: x(k+1) has the sum of them added to its first ``n_y`` states.
 
     Raises ModelError for numbers of signals, states or units that cannot be.
     """
@@ -51,20 +53,23 @@ class Identified(Model):
     rest: Tensor  # (n_x, n_y + n_v + 1)
     rest_cov: Tensor  # (n_x, n_x)
     dead: Tensor  # (n_mv,) [periods]
+    load_moves: Tensor  # (recorded, n_y) scaled, a period
 
-    def __init__(self, n_y: int, n_mv: int, n_dv: int, n_x: int, n_hidden: int = 0) -> None:
+    def __init__(self, n_y: int, n_mv: int, n_dv: int, n_x: int, n_hidden: int = 0, recorded: int = 0) -> None:
         super().__init__()
         sizes = {"n_y": n_y, "n_mv": n_mv, "n_dv": n_dv, "n_x": n_x, "n_hidden": n_hidden}
         if min(n_y, n_mv) < 1 or min(n_dv, n_hidden) < 0 or n_x < n_y:
             stated = ", ".join(f"{name}={value}" for name, value in sizes.items())
             raise ModelError(f"an identified model has {stated}; give n_y and n_mv >= 1, n_x >= n_y, the others >= 0")
         self.n_y, self.n_mv, self.n_dv, self.n_x, self.n_hidden = n_y, n_mv, n_dv, n_x, n_hidden
+        self.recorded = recorded
         n_v = n_mv + n_dv
         self.reserve(a=(n_x, n_x), b=(n_x, n_v), c=(n_x,))
         self.reserve(w1=(n_hidden, n_x + n_v), b1=(n_hidden,), w2=(n_x, n_hidden))
         self.reserve(y_center=(n_y,), y_scale=(n_y,), v_center=(n_v,), v_scale=(n_v,))
         self.reserve(noise=(n_y,), rest=(n_x, n_y + n_v + 1), rest_cov=(n_x, n_x), dead=(n_mv,))
         self.reserve(colour=(n_y,), gain_sd=(n_mv,), pace_sd=(1,), dead_sd=(1,))
+        self.reserve(load_moves=(recorded, n_y))
 
     @property
     def n_v(self) -> int:

@@ -12,10 +12,11 @@ from pipeline.config.known import NONE
 from pipeline.models.base import Model
 from pipeline.models.identified.assembly import assembled, noise_of
 from pipeline.models.identified.candidates import on_all_rows, within_limits
+from pipeline.models.identified.coupling import sign_margin
 from pipeline.models.identified.doubt import colour_of, doubt_of
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.innovations import Innovations, innovations, noise_of_filter
+from pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
 from pipeline.models.identified.known_answers import known_figures
 from pipeline.models.identified.network_search import UNITS
 from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
@@ -48,6 +49,12 @@ Figures = Mapping[str, Mapping[str, Any]]
 
 OUTSIDE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
+
+LIKELY_SDS = 2.0
+"""Standard deviations of an open answer that a controller of several loops must stand."""
+
+LOAD_ROWS = 8_000
+"""Rows at most whose loads go with the model."""
 
 PARTS = 40
 """Parts of the held-out rows that are independent, for all that counts: neighbouring rows of a run err alike."""
@@ -139,9 +146,13 @@ class IdentifiedPart(Part):
         cells = Cells.of(bands, rows, n_mv, curves.shape[2]) if structure.n_hidden else None
         size = STEP * rows.v.std(axis=0)
         proven = answers(curves, structure, problem.data, size, n_mv, cells, weights)
+        # As much of the outputs as there are MVs is controlled.
+        last = np.median(curves[:, :n_mv, -1, :n_mv], axis=0).T / size[:n_mv]
+        controlled = {place: answer for place, answer in proven[0].items() if place[0] < n_mv}
+        margin = sign_margin(controlled, last, LIKELY_SDS) if n_mv > 1 else None
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
-        known = {"noise": noise, "colour": colour, **open_to}
+        known = {"noise": noise, "colour": colour, "load_moves": _load_moves(fitted.model, whole), **open_to}
         model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
@@ -168,7 +179,9 @@ class IdentifiedPart(Part):
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
             "gains": gain_table,
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
-            "proof": _proof(searched, record, proven, runs, noise * scales.y_scale) | said,
+            "proof": _proof(searched, record, proven, runs, noise * scales.y_scale)
+            | {"sign_margin": margin if margin is None or np.isfinite(margin) else None}
+            | said,
             "open": {name: values.tolist() for name, values in open_to.items()},
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],
             "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
@@ -228,6 +241,13 @@ def _residuals(problem: Problem, structure: Structure, model: Dynamics) -> tuple
     elif isinstance(model, Innovations):
         return noise_of_filter(model, np.concatenate(found)), found, whole
     return noise_of(found), found, whole
+
+
+def _load_moves(model: Dynamics, whole: Sequence[Stretch]) -> Array:
+    """Changes (n, n_y) of the loads from row to row, scaled, over rows of a record in closed loop; none of another."""
+    if not isinstance(model, Innovations):
+        return np.empty((0, whole[0].y.shape[1]))
+    return load_moves(model, whole)[:LOAD_ROWS]
 
 
 def _visited(model: Dynamics, data: Sequence[Stretch], correction: float) -> list[Array]:

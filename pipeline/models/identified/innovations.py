@@ -157,6 +157,20 @@ def ahead(model: Innovations, stretch: Stretch, rows: int = AHEAD) -> tuple[Arra
     return stretch.y[begins:], predicted[begins:]
 
 
+def load_moves(model: Innovations, data: Sequence[Stretch]) -> Array:
+    """Changes (n, n_y) of the loads from row to row, as the filter sees them, over all rows that count.
+
+    No change stands for the step from one stretch to the next. Empty where the filter explodes.
+    """
+    found = [np.empty((0, model.n_loads))]
+    for stretch in data:
+        states = _filtered(model, stretch)
+        if states is None:
+            return found[0]
+        found.append(np.diff(states[_begins(stretch) :, model.n_x - model.n_loads :], axis=0))
+    return np.concatenate(found)
+
+
 def _filtered(model: Dynamics, stretch: Stretch) -> Array | None:
     """States (n, n_x) foreseen by the filter from the first outputs, all else at zero; None where it explodes."""
     run = model.free_run(np.r_[stretch.y[0], np.zeros(model.n_x - stretch.y.shape[1])], stretch)

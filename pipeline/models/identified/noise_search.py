@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.errors import ModelError
 from pipeline.models.identified.candidates import Task
+from pipeline.models.identified.innovations import innovations
 from pipeline.models.identified.linear_search import LinearSearch
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.structure import Problem, Structure
@@ -89,6 +90,7 @@ class NoiseSearch:
         others = {t.structure: t.fits for t in self.rounds.trials(further, "the best of them on all rows")[0]}
         whole = [Trial(t.structure, {**t.fits, **others.get(t.structure, {})}) for t in shortlist]
         whole = [t for t in whole if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
+        whole = self.following(whole) or whole
         return self.ranked(whole) if whole else shortlist
 
     def networks(self, linear: Sequence[Trial], units: Sequence[int]) -> list[Trial]:
@@ -101,7 +103,22 @@ class NoiseSearch:
         costs = np.cumsum([self.rounds.budget.of(t.structure, t.iterations) for t in tasks])
         affordable = [t for t, cost in zip(tasks, costs, strict=True) if cost <= self.rounds.budget.left()]
         trials, _ = self.rounds.trials(affordable, "neural networks with their noise")
-        return sorted((t for t in trials if t.folds == linear[0].folds), key=lambda t: t.rank)
+        whole = [t for t in self.following(trials) if t.folds == linear[0].folds]
+        return sorted(whole, key=lambda t: t.rank)
+
+    def following(self, trials: Sequence[Trial]) -> list[Trial]:
+        """The trials without the fits whose filter explodes over the whole record, and without those of no other fits.
+
+        A fit has followed the rows that it was trained on, and the held-out ones; together they begin elsewhere.
+        """
+        problem = self.rounds.problem
+        kept = []
+        for t in trials:
+            rows = problem.whole(t.structure)
+            fits = {key: f for key, f in t.fits.items() if innovations(f.model, rows) is not None}
+            if {fold for fold, _ in fits} == set(t.folds):
+                kept.append(replace(t, fits=fits))
+        return kept
 
     def ranked(self, trials: Sequence[Trial]) -> list[Trial]:
         """Best first, by the log-likelihood of the held-out rows less one nat a state; what is known comes before it.

@@ -16,6 +16,7 @@ from pipeline.models.identified.innovations import (
     begun,
     filter_gain,
     innovations,
+    load_moves,
     noise_of_filter,
     typical,
     with_loads,
@@ -138,6 +139,19 @@ def test_fits_find_the_plant_under_a_wandering_load_where_free_runs_do_not() -> 
     missed, of_runs = (float(np.abs(np.array(gains) - 2.0).mean()) for gains in (by_steps, by_runs))
     assert missed < 0.15
     assert of_runs > 5 * missed
+
+
+def test_the_moves_of_the_loads_are_those_that_the_filter_sees() -> None:
+    """L e of the loads' rows, over the rows that count of each stretch; none where the filter explodes."""
+    model, n_x = drawn(), 5
+    parts = [rows(model, 400, 1), rows(model, 300, 2)]
+    found = load_moves(model, parts)
+    errors = [innovations(model, [part]) for part in parts]
+    expected = [e[:-1] @ model.gain[n_x - 2 :].T for e in errors if e is not None]
+    np.testing.assert_allclose(found, np.concatenate(expected), atol=1e-9)
+    wild = replace(model, a=2 * model.a)
+    assert innovations(wild, parts) is None
+    assert load_moves(wild, parts).shape == (0, 2)
 
 
 def test_slow_outputs_count_as_much_as_fast_ones() -> None:

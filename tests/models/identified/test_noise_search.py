@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 from closed_loop_records import LOOPS, SIGNALS
 
+from pipeline.models.identified.candidates import on_all_rows
 from pipeline.models.identified.identified_part import IdentifiedPart
+from pipeline.models.identified.innovations import innovations
+from pipeline.models.identified.noise_search import NoiseSearch
+from pipeline.models.identified.rounds import Rounds
+from pipeline.models.identified.structure import Budget
 from pipeline.models.part import Learnt, Source
 
 QUICK = IdentifiedPart(units=(), orders=(2, 3))
@@ -51,3 +56,21 @@ def test_a_correction_that_is_given_keeps_the_search_by_free_runs() -> None:
     assert found["structure"]["noise"] == "none"
     assert found["structure"]["rows_ahead"] is None
     assert "one_step" not in found["proof"]
+
+
+def test_a_fit_whose_filter_explodes_over_the_whole_record_is_no_candidate() -> None:
+    """Such a one was chosen by its held-out rows, and no model came of the record."""
+    source = Source(LOOPS[MOVED].record(1_200, 0), SIGNALS)
+    searched = source.result(replace(QUICK, minutes=0.05).groundwork())
+    problem = searched.problem
+    trial = searched.selection.chosen
+    search = NoiseSearch.of(Rounds(problem, Budget(1.0, 1_000, 1), "test"))
+    (key, fitted), *others = trial.fits.items()
+    wild = replace(fitted, model=replace(fitted.model, a=3 * fitted.model.a))
+    assert innovations(wild.model, problem.whole(trial.structure)) is None
+    spoilt = replace(trial, fits={key: wild, **dict(others)})
+    assert [t.fits for t in search.following([trial, spoilt])] == [trial.fits]
+    twice = replace(trial, fits={**trial.fits, (key[0], 99): wild})
+    assert [set(t.fits) for t in search.following([twice])] == [set(trial.fits)]
+    # Of such a fit the one of its fold is kept as it is, and the record has a model all the same.
+    assert on_all_rows(problem, trial.structure, wild) is wild

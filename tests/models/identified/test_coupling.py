@@ -1,0 +1,68 @@
+"""What uncertain answers of several loops are worth: the margin of integral action over what a record leaves open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.models.identified.coupling import MOST_OPEN, sign_margin
+from pipeline.models.identified.proof import Answer
+
+CERTAIN = Answer(1.0, 0.9, 1.1, 1, 9, 1.0, 0.05)
+GAINS = np.array([[1.0, 0.3, -0.1], [-0.3, 0.8, 0.2], [0.4, -0.2, 1.0]])
+
+
+def answers_of(gains: np.ndarray, sd: dict[tuple[int, int], float]) -> dict[tuple[int, int], Answer]:
+    """An answer of each pair, certain unless a larger ``sd`` is given."""
+    return {
+        (i, j): replace(CERTAIN, model=g, low=0.9 * g, high=1.1 * g, direct=g, sd=sd.get((i, j), 0.05 * abs(g)))
+        for (i, j), g in np.ndenumerate(gains)
+    }
+
+
+def integral_loop(plant: np.ndarray, model: np.ndarray) -> float:
+    """The largest radius of slow integral action u+ = u + .01 G^-1 e on a plant of gains."""
+    return float(np.abs(np.linalg.eigvals(np.eye(len(plant)) - 0.01 * plant @ np.linalg.inv(model))).max())
+
+
+def test_certain_answers_keep_the_whole_worth() -> None:
+    """Without an open answer there is one corner, the model."""
+    assert sign_margin(answers_of(GAINS, {}), np.zeros((3, 3)), 2.0) == pytest.approx(1.0)
+
+
+def test_a_weak_coupling_that_is_open_costs_little_and_a_main_answer_all() -> None:
+    """Both have an uncertain sign: of the coupling either serves, of the answer that holds its PV only one."""
+    weak = sign_margin(answers_of(GAINS, {(1, 2): 0.14}), np.zeros((3, 3)), 2.0)
+    main = sign_margin(answers_of(GAINS, {(1, 1): 0.5}), np.zeros((3, 3)), 2.0)
+    assert weak > 0.7
+    assert main < 0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_above_zero_each_corner_is_stable_under_slow_integral_action(seed: int) -> None:
+    """And below it one is not."""
+    rng = np.random.default_rng(seed)
+    gains = rng.normal(size=(2, 2)) + 1.5 * np.eye(2)
+    sd = {(0, 1): 0.4 * abs(gains[0, 1]) + 0.3, (1, 0): 0.4 * abs(gains[1, 0]) + 0.3}
+    margin = sign_margin(answers_of(gains, sd), np.zeros((2, 2)), 2.0)
+    corners = []
+    for one in (-2, 2):
+        for other in (-2, 2):
+            plant = gains.copy()
+            plant[0, 1] += one * sd[0, 1]
+            plant[1, 0] += other * sd[1, 0]
+            corners.append(integral_loop(plant, gains))
+    if abs(margin) > 0.02:
+        assert (max(corners) < 1) == (margin > 0)
+
+
+def test_too_many_open_answers_or_one_without_a_number_prove_nothing() -> None:
+    """Minus infinity: no corner was looked at."""
+    gains = np.eye(3) + 0.2
+    every = dict.fromkeys(np.ndindex(3, 3), 1.0)
+    assert len(every) > MOST_OPEN
+    assert sign_margin(answers_of(gains, every), np.zeros((3, 3)), 2.0) == -np.inf
+    unknown = answers_of(gains, {}) | {(0, 1): Answer(0.2, 0.1, 0.3, 1, 9)}
+    assert sign_margin(unknown, np.zeros((3, 3)), 2.0) == -np.inf

@@ -1,0 +1,176 @@
+"""What an engineer knows, in the search: delays, inputs without an effect, candidates behind, and the last word."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import made_plants
+import numpy as np
+import pytest
+from closed_loop_records import LOOPS, SIGNALS, OperatedLoop
+
+from pipeline.config.known import stated
+from pipeline.evaluation.known import known_rows
+from pipeline.evaluation.proof import sign_doubts, statements
+from pipeline.models.identified.dynamics import Dynamics
+from pipeline.models.identified.identified_part import IdentifiedPart
+from pipeline.models.identified.knowledge import Knowledge, Pair
+from pipeline.models.identified.linear_search import smallest_first
+from pipeline.models.identified.output_error import Fitted
+from pipeline.models.identified.scaled_record import ScaledRecord
+from pipeline.models.identified.structure import Structure
+from pipeline.models.identified.trial import Trial, best_of
+from pipeline.models.part import Source
+from pipeline.plants.signals import Signals
+from pipeline.records.record import Record
+
+QUICK = IdentifiedPart(minutes=0.2, orders=(2, 4), units=())
+UNCERTAIN = OperatedLoop(gain=2.0, dead=3, kc=0.5, ti=10.0, hold=200, sp=4.0)
+CERTAIN = LOOPS["steps by hand, small loads"]  # of gain -2
+INF = float("inf")
+
+
+def learnt(record: Record, signals: Signals, *known: tuple[str, str, str]) -> dict[str, Any]:
+    """metrics.json of the model set."""
+    said = tuple(stated(*of) for of in known)
+    metrics = QUICK.learn(Source(record, signals, known=said)).metrics
+    return {"": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": metrics}}}}}
+
+
+def figures(models: dict[str, Any]) -> Any:
+    return models[""]["parts"]["identified"]["per_seed"]["0"]
+
+
+def test_the_word_of_an_engineer_decides_what_the_record_leaves_open() -> None:
+    record = UNCERTAIN.record(1_500, 0)
+    alone, right, wrong = (learnt(record, SIGNALS, *([("y", "u", sign)] if sign else [])) for sign in ("", "+", "-"))
+    assert sign_doubts(alone)
+    assert known_rows(alone) == []
+    assert sign_doubts(right) == ""
+    (row,) = known_rows(right)
+    assert (row.limit, row.holds) == ("+", True)
+    assert [r.holds for r in statements(right)][-1] is True
+    assert figures(right)["proof"]["known"][0]["verdict"] == "open"
+    # Nothing of the record is certain of the other sign, so that there is no question; but no model has it either.
+    assert sign_doubts(wrong)
+    assert "question" not in figures(wrong)["proof"]["known"][0]
+    assert [r.holds for r in known_rows(wrong)] == [False]
+    # The same models were fitted to the same rows.
+    assert figures(alone)["gains"] == figures(right)["gains"]
+    assert "known" not in figures(alone)["proof"]
+
+
+@pytest.mark.parametrize("said", ["+", "gain -0.6..-0.2"])
+def test_what_the_record_is_certain_to_contradict_is_a_question_and_bends_no_model(said: str) -> None:
+    record = CERTAIN.record(1_500, 0)
+    asked, true = learnt(record, SIGNALS, ("y", "u", said)), learnt(record, SIGNALS, ("y", "u", "gain -3..-1"))
+    (of,) = figures(asked)["proof"]["known"]
+    assert of["verdict"] == "contradicted"
+    assert of["question"] in sign_doubts(asked)
+    (row,) = known_rows(asked)
+    assert (row.holds, row.because) == (False, of["question"])
+    assert figures(asked)["gains"]["y"]["u"]["gain"] == pytest.approx(-2.0, rel=0.1)
+    assert sign_doubts(true) == ""
+    assert figures(true)["proof"]["known"][0]["verdict"] == "agrees"
+
+
+def disturbed(n: int = 1_000) -> tuple[Record, Signals]:
+    """One output that u0 moves by .5; d0, which does nothing, goes with u0."""
+    rng = np.random.default_rng(0)
+    signals = made_plants.signals_of(1, 1, 1)
+    u = made_plants.random_holds(rng, n, 20)
+    d = (u - 50) / 8 + rng.normal(0, 0.3, n)
+    y = np.empty(n)
+    x = u[0]
+    for k in range(n):
+        y[k] = 20 + 0.5 * x + 0.3 * rng.normal()
+        x += 0.1 * (u[k] - x)
+    return Record.of(signals, y[:, None], u[:, None], dv=d[:, None]), signals
+
+
+def test_an_input_without_effect_has_none_in_the_model() -> None:
+    record, signals = disturbed()
+    guessed = figures(learnt(record, signals))["gains"]["y0"]
+    known = figures(learnt(record, signals, ("y0", "d0", "none")))
+    assert guessed["d0"]["gain"] != 0
+    assert (known["gains"]["y0"]["d0"]["gain"], known["gains"]["y0"]["d0"]["sign"]) == (0.0, "none")
+    assert known["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.05)
+    assert np.abs(known["step_responses"]["y0"]["d0"]["high"]).max() == 0.0
+    assert known["proof"]["known"][0]["verdict"] == "open"
+
+
+def test_an_effect_that_the_record_is_certain_of_is_asked() -> None:
+    record = made_plants.two_by_two(1_200)
+    found = learnt(record, made_plants.signals_of(2, 2), ("y0", "u1", "none"), ("y1", "u1", "+"))
+    assert [of["verdict"] for of in figures(found)["proof"]["known"]] == ["contradicted", "agrees"]
+    assert figures(found)["gains"]["y0"]["u1"]["gain"] == pytest.approx(-0.3, abs=0.05)
+
+
+def test_a_dead_time_limits_the_delays_on_offer() -> None:
+    record, signals = made_plants.second_order(800, delay=4), made_plants.signals_of(1, 1)  # periods of 2 s
+    free = {tuple(c["delays"]) for c in figures(learnt(record, signals))["candidates_tried"]}
+    short = {
+        tuple(c["delays"]) for c in figures(learnt(record, signals, ("y0", "u0", "dead 0..4")))["candidates_tried"]
+    }
+    exact = figures(learnt(record, signals, ("y0", "u0", "dead 8..8")))
+    assert max(free) > (2,)
+    assert max(short) <= (2,)
+    assert {tuple(c["delays"]) for c in exact["candidates_tried"]} == {(4,)}
+    assert exact["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "n_y", "wanted"),
+    [
+        ([], 1, (0, 7)),
+        ([Pair(0, 0, -INF, INF, delays=(2, 4))], 1, (2, 7)),
+        ([Pair(0, 1, -INF, INF, delays=(2, 4))], 1, (0, 4)),
+        ([Pair(0, 0, -INF, INF, delays=(2, 4)), Pair(1, 0, -INF, INF, delays=(3, 9))], 2, (2, 7)),
+        ([Pair(0, 0, -INF, INF, delays=(2, 4))], 2, (0, 7)),  # the other output may answer at once
+        ([Pair(0, 0, -INF, INF, delays=(2, 4)), Pair(1, 0, 0.0, 0.0, none=True)], 2, (2, 7)),
+    ],
+)
+def test_an_input_has_one_delay_for_all_outputs(pairs: list[Pair], n_y: int, wanted: tuple[int, ...]) -> None:
+    assert Knowledge(tuple(pairs), n_y).delays((0, 7)) == wanted
+
+
+def first_order(gain: float, pole: float = 0.8) -> Dynamics:
+    return Dynamics.linear(np.array([[pole]]), np.array([[(1 - pole) * gain if pole < 1 else gain]]))
+
+
+@pytest.mark.parametrize(
+    ("pair", "model", "against"),
+    [
+        (Pair(0, 0, 0.0, INF), first_order(0.5), False),
+        (Pair(0, 0, 0.0, INF), first_order(-0.5), True),
+        (Pair(0, 0, 1.0, 2.0), first_order(0.5), True),
+        (Pair(0, 0, 0.2, 0.4), first_order(0.5), True),
+        (Pair(0, 0, 0.0, 0.0, none=True), first_order(0.5), True),
+        (Pair(0, 0, 0.0, 0.0, none=True), first_order(0.05), False),
+        (Pair(0, 0, 0.0, INF), first_order(-0.01, 1.0), True),  # of an integrating output the way it goes
+        (Pair(0, 0, 1.0, 2.0), first_order(0.01, 1.0), False),  # and no more
+        (Pair(0, 0, -INF, INF, delays=(1, 2)), first_order(-0.5), False),
+    ],
+)
+def test_a_model_contradicts_what_is_known_by_its_gain(pair: Pair, model: Dynamics, against: bool) -> None:
+    v = np.random.default_rng(0).uniform(-1, 1, (200, 1))
+    rows = ScaledRecord(np.zeros((200, 1)), v, np.zeros(200, dtype=np.int64))
+    assert bool(Knowledge((pair,), 1).against(model, rows)) is against
+
+
+def trial(order: int, error: float, *against: bool) -> Trial:
+    """With a fit a fold."""
+    fits = {
+        (k, 0): Fitted(first_order(1.0), [], error, error, 1, frozenset({0}) if a else frozenset())
+        for k, a in enumerate(against)
+    }
+    return Trial(Structure("balanced", order, (0, 0), (0,)), fits)
+
+
+def test_candidates_that_contradict_what_is_known_rank_behind_all_that_agree() -> None:
+    both, one, none = trial(2, 0.1, True, True), trial(3, 0.2, False, True), trial(4, 0.3, False, False)
+    assert smallest_first([both, one, none]) == [none, one, both]
+    assert best_of([both, one, none]) is none
+    assert best_of([both, one]) is one
+    agreeing = [trial(2, 0.1, False, False), trial(3, 0.2, False, False)]
+    assert smallest_first(agreeing) == agreeing
