@@ -138,7 +138,7 @@ def _both(first: Known, second: Known) -> Known:
 
 def _number(text: str, where: str) -> float:
     try:
-        return float(text.replace(",", "."))
+        return float(text.replace(",", ".").replace("\N{MINUS SIGN}", "-"))
     except ValueError:
         raise ValueError(f"{where!r}: {text!r} is no number; write {FORMS}") from None
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.evaluation.evidence import Evidence
 from pipeline.evaluation.metric import gate_ratio
+from pipeline.evaluation.model_evidence import IDENTIFIED
 from pipeline.simulation.scenario import NOISE_SUFFIX
 
 CLEARLY: Final = 0.9  # of the error without control: a law that leaves more of it follows no set point
@@ -53,10 +54,10 @@ def no_better_than_no_control(evidence: Evidence, law: str) -> str:
 def limit_cycle(evidence: Evidence, law: str) -> str:
     """The worst limit cycle of a law on models that did not go wrong, in words; empty where there is none.
 
-    Models have no valve that sticks and no coarse reading, so that the law alone makes it.
+    Models have no valve that sticks and no coarse reading, so that the law alone makes it. A simulator may have both.
     """
     worst = worst_cycle(evidence, law)
-    if worst is None or worst in evidence.case.gone_wrong:
+    if worst is None or evidence.case.stand_in != IDENTIFIED or worst in evidence.case.gone_wrong:
         return ""
     return f"{evidence.laws[law].metrics.cycles[worst].words} in {worst}"
 

@@ -115,9 +115,14 @@ def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -
     return bool(of_one_sign and abs(found["direct"]) >= LIKELY * found["sd"])
 
 
-def _by_region(found: Mapping[str, Any], *, shown: bool) -> bool:
-    """Whether an answer whose gain turns or fades holds: in each region where it is not small, the PV ``shown``."""
+def _by_region(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> bool:
+    """Whether an answer whose gain turns or fades holds: in each region where it is not small, the PV ``shown``.
+
+    A region of another sign than an engineer says holds nowhere.
+    """
     told = [region for region in found.get("regions") or () if not region["small"]]
+    if known and any(known["way"] * region["model"] < 0 for region in told):
+        return False
     return shown and bool(told) and all(_holds(region, {}, shown=True) for region in told)
 
 
@@ -126,11 +131,13 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
     foreseen = _foreseen(proof, pv)
     shown = foreseen or _followed(proof, pv)
     if by_region:
-        holds = _by_region(found, shown=shown)
+        holds = _by_region(found, known, shown=shown)
         limit = "certain in sign in each region where it is not small, and of the size that one-step predictions find"
         because = _by_regions_why(found, shown=shown, holds=holds)
+        if known and not holds:
+            because += f"; an engineer says {known['says']!r}: is it so in all of the range?"
     else:
-        little = not known and _matters_little(found, proof, shown=shown)
+        little = not known and _matters_little(pv, found, proof, shown=shown)
         holds = little or _holds(found, known, shown=foreseen)
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
         because = LITTLE if little else _word(found, known, holds=holds) or _why(pv, mv, found)
@@ -143,9 +150,9 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
     )
 
 
-def _matters_little(found: Mapping[str, Any], proof: Mapping[str, Any], *, shown: bool) -> bool:
+def _matters_little(pv: str, found: Mapping[str, Any], proof: Mapping[str, Any], *, shown: bool) -> bool:
     """Whether an uncertain answer of several loops may be what it will: the PV ``shown``, the others hold the plant."""
-    margin = proof.get("sign_margin")
+    margin = (proof.get("sign_margin") or {}).get(pv)
     return shown and found["verdict"] == "uncertain" and margin is not None and margin >= COUPLED
 
 

@@ -80,7 +80,7 @@ def test_an_uncertain_answer_that_all_loops_stand_either_way_refuses_no_controll
 ) -> None:
     """Where the inputs foresee the PV, and the record contradicts nothing."""
     found = in_closed_loop(nats, verdict=verdict, direct=0.1, sd=0.5)
-    found[""]["parts"]["identified"]["per_seed"]["0"]["proof"]["sign_margin"] = margin
+    found[""]["parts"]["identified"]["per_seed"]["0"]["proof"]["sign_margin"] = {"y0": margin}
     assert (sign_doubts(found) == "") is ships
 
 

@@ -203,8 +203,9 @@ def _courses(rng: np.random.Generator, horizon: int, hold: int, count: int) -> A
 def _replayed(model: Identified, n: int, quiet: int, loops: int) -> Array:
     """Loads (n, loops, n_y), scaled, as the record's went on, from nothing after ``quiet`` samples, each elsewhere."""
     moves = model.load_moves.numpy()
-    late = max(len(moves) - (n - quiet), 0)
-    rows = np.linspace(0, late, loops).astype(int)[None, :] + np.arange(n - quiet)[:, None]
+    # Of a short record each loop begins elsewhere, too, and goes on from its end to its beginning.
+    firsts = np.linspace(0, max(len(moves) - (n - quiet), 0) or len(moves), loops, endpoint=False).astype(int)
+    rows = firsts[None, :] + np.arange(n - quiet)[:, None]
     course = np.cumsum(moves[rows % len(moves)], axis=0)  # (n - quiet, loops, n_y)
     return np.concatenate([np.zeros((quiet, loops, model.n_y)), course])
 

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from pipeline.engine.progress import steps
+from pipeline.errors import LawError
 from pipeline.laws.base import ControlLaw
 from pipeline.laws.predictive.side_by_side import side_by_side
 from pipeline.laws.predictive.trials import Outcome
@@ -39,7 +40,7 @@ class Candidate:
 
     @property
     def error(self) -> float:
-        """J without its travel."""
+        """J without its travel: the errors, and the price of numbers far from the first."""
         return self.cost - TRAVEL * self.travel
 
     def row(self) -> dict[str, float]:
@@ -92,6 +93,11 @@ def searched(
     show = steps("tuning in closed loops on the model with errors", 1 + sum(map(len, (COARSE, HORIZONS, JUMPS, FINE))))
     given = trials.run(side_by_side([law_of(start)]), 1)
     tried = judged(given, given, [start])
+    if not np.isfinite(tried[0].cost):
+        raise LawError(
+            "its loops are not stable on its own model with the errors that the record leaves open; choose another "
+            "law, or record more"
+        )
     best = tried[0]
 
     def tried_all(changes: Sequence[Numbers]) -> None:
@@ -157,7 +163,8 @@ def in_words(tried: Sequence[Candidate]) -> str:
         f"time, with loads and noise; the cost fell from {first:.3g} to {last:.3g}. It is the mean of the errors at "
         "set points and under loads, each over that with the first numbers, .05 for a travel of 1 % of the MVs' range "
         f"a sample, and a little for numbers far from the first. Of those within {100 * CALM:.0f} % of the least "
-        "error, those of the least travel are taken; a higher `speed` moves more and errs less, as the table shows."
+        "cost without travel, those of the least travel are taken; a higher `speed` moves more and errs less, as the "
+        "table shows."
     )
 
 

@@ -269,9 +269,12 @@ def within_limits(problem: Problem, structure: Structure, fitted: Fitted) -> Fit
         a = model.a.copy()
         a[: plant.n_x, : plant.n_x] = within_unit_circle(plant.a, 1 - 1e-9)
         whole, inner = problem.whole(structure), replace(model, a=a)
-        if innovations(inner, whole) is None:  # the gain was that of another plant
-            inner = begun(inner.plant, whole)
-        return PredictionError(iterations=5).fit(inner, whole, gain_alone=True)
+        try:
+            if innovations(inner, whole) is None:  # the gain was that of another plant
+                inner = begun(inner.plant, whole)
+            return PredictionError(iterations=5).fit(inner, whole, gain_alone=True)
+        except ModelError:  # no filter follows: laws say what they think of such a plant
+            return replace(fitted, model=inner)
     inside = replace(model, a=within_unit_circle(model.a, 1 - 1e-9))
     again = OutputError(iterations=5, correction=structure.correction)
     return again.fit(inside, problem.whole(structure), free=inside.mask(b=True, c=True))

@@ -12,9 +12,31 @@ from itertools import product
 import numpy as np
 
 from pipeline.models.identified.proof import UNCERTAIN, Answer
+from pipeline.models.identified.structure import Structure
 from pipeline.plants.simulator import Array
 
 MOST_OPEN = 8  # answers that are open together
+
+
+def unused_answers(
+    answers: Mapping[tuple[int, int], Answer], unit: Array, structure: Structure, shape: tuple[int, int]
+) -> Array:
+    """Answers (n_cv, n_mv), scaled, of the pairs that no controller uses, 0 of the others.
+
+    ``unit`` (n_v, length, n_y) are the model's answers to unit steps. Each is the mean over the rows of the strongest
+    answer of its output, so that all of one output are of one age.
+    """
+    found = np.zeros(shape)
+    for i in range(shape[0]):
+        used = {j: answer for (of, j), answer in answers.items() if of == i}
+        if not used:
+            continue
+        strongest = max(used.values(), key=lambda answer: abs(answer.model))
+        for j in set(range(shape[1])) - set(used):
+            late = 1 + structure.delays[j] - int(structure.same_row)  # row of the first point
+            first, last = (max(row - late, 0) for row in (strongest.first, strongest.last))
+            found[i, j] = unit[j, first : last + 1, i].mean() if strongest.last >= late else 0.0
+    return found
 
 
 def sign_margin(answers: Mapping[tuple[int, int], Answer], rest: Array, sds: float) -> float:

@@ -12,7 +12,7 @@ from pipeline.config.known import NONE
 from pipeline.models.base import Model
 from pipeline.models.identified.assembly import assembled, noise_of
 from pipeline.models.identified.candidates import on_all_rows, within_limits
-from pipeline.models.identified.coupling import sign_margin
+from pipeline.models.identified.coupling import sign_margin, unused_answers
 from pipeline.models.identified.doubt import colour_of, doubt_of
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.identified import Identified
@@ -146,10 +146,10 @@ class IdentifiedPart(Part):
         cells = Cells.of(bands, rows, n_mv, curves.shape[2]) if structure.n_hidden else None
         size = STEP * rows.v.std(axis=0)
         proven = answers(curves, structure, problem.data, size, n_mv, cells, weights)
-        # As much of the outputs as there are MVs is controlled.
-        last = np.median(curves[:, :n_mv, -1, :n_mv], axis=0).T / size[:n_mv]
-        controlled = {place: answer for place, answer in proven[0].items() if place[0] < n_mv}
-        margin = sign_margin(controlled, last, LIKELY_SDS) if n_mv > 1 else None
+        n_cv = min(len(source.signals.sp), n_y)
+        controlled = {place: answer for place, answer in proven[0].items() if place[0] < n_cv}
+        unused = unused_answers(controlled, np.median(curves, axis=0) / size[:, None, None], structure, (n_cv, n_mv))
+        margin = sign_margin(controlled, unused, LIKELY_SDS) if n_mv > 1 else -np.inf
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
         known = {"noise": noise, "colour": colour, "load_moves": _load_moves(fitted.model, whole), **open_to}
@@ -180,7 +180,7 @@ class IdentifiedPart(Part):
             "gains": gain_table,
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
             "proof": _proof(searched, record, proven, runs, noise * scales.y_scale)
-            | {"sign_margin": margin if margin is None or np.isfinite(margin) else None}
+            | ({"sign_margin": dict.fromkeys(names[:n_cv], margin)} if np.isfinite(margin) else {})
             | said,
             "open": {name: values.tolist() for name, values in open_to.items()},
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],

@@ -162,7 +162,7 @@ def smallest_first(trials: Sequence[Trial]) -> list[Trial]:
     A state less is one less to mislead. Those that contradict what is known of the plant come after all others.
     """
     most = max((len(t.fits) for t in trials), default=0)
-    ranked = sorted(trials, key=lambda t: (t.against, len(t.fits) < most, t.error))
+    ranked = sorted(trials, key=lambda t: (len(t.fits) < most, t.against, t.error))
     near = [t for t in ranked if t.error <= 1.01 * ranked[0].error and len(t.fits) == len(ranked[0].fits)]
     near = [t for t in near if t.against == ranked[0].against]
     first = min(near, key=lambda t: (t.structure.order + sum(t.structure.delays), t.error), default=None)

@@ -195,5 +195,7 @@ def dead_times(response: Array, weight: Array) -> list[int]:
     """
     size = np.abs(response * weight)
     visible = size > size.max(axis=0) / 6
-    first = np.where(visible.any(axis=0), visible.argmax(axis=0), 0).min(axis=0)
-    return [max(int(d) - 1, 0) for d in first]
+    # An output that an input does not move at all says nothing of its dead time.
+    moved = size.max(axis=0) > 0
+    first = np.where(moved, visible.argmax(axis=0), len(size)).min(axis=0)
+    return [max(int(d) - 1, 0) if any_moved else 0 for d, any_moved in zip(first, moved.any(axis=0), strict=True)]

@@ -63,9 +63,12 @@ class Answer:
         """``proven``, or what speaks against it: ``uncertain``, ``opposite``, ``halves``, ``size``.
 
         ``turns`` or ``fades`` where something speaks against the mean answer, but in no region against that of the
-        region: it is proven or uncertain there.
+        region: it is proven or uncertain there. A proven mean does not outweigh a region of the other sign.
         """
         told = [region for region in self.regions if not region.small]
+        against = [r.answer.verdict for r in told if r.answer.verdict in {OPPOSITE, HALVES}]
+        if self._of_all == PROVEN and against:
+            return against[0]
         if self._of_all == PROVEN or not told or any(r.answer.verdict not in {PROVEN, UNCERTAIN} for r in told):
             return self._of_all
         return TURNS if min(r.answer.model for r in told) < 0 < max(r.answer.model for r in told) else FADES

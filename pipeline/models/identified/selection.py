@@ -19,6 +19,9 @@ from pipeline.models.identified.row_convention import may_act_in_its_row
 from pipeline.models.identified.structure import Problem
 from pipeline.models.identified.trial import Trial, best_of
 
+SETTLES = 0.98
+"""Slowest pole of a fold up to which it speaks for a plant that settles, where another fold's integrates."""
+
 NEARLY = 1.02
 """Relative error up to which a linear model that settles stands in for one that integrates."""
 
@@ -137,7 +140,7 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     Free runs would rank them by how they read the controller backwards, and by the loads that nobody measures.
     """
     search = NoiseSearch.of(rounds)
-    linear = search.linear(orders)
+    linear = _settling_first(rounds.problem, search.linear(orders))
     settles = not _integrates(linear[0])
     search = replace(search, rounds=replace(rounds, problem=replace(rounds.problem, settles=settles)))
     networks = search.networks(linear, units)
@@ -148,6 +151,22 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
 
 def _nearly(trial: Trial, best: Trial) -> bool:
     return trial.against <= best.against and trial.error <= NEARLY * best.error
+
+
+def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
+    """Where one fold's best integrates and another's settles, one that settles in all first, if it errs as little.
+
+    A load that wanders and a state of the plant that drifts are hard to tell apart one row ahead. A plant that
+    integrates does so in each part of its record; a state that drifts in one alone is the load's, and leaves the plant
+    without a gain.
+    """
+    best = linear[0]
+    slowest = [_slowest(best, fold) for fold in best.folds]
+    if max(slowest) <= INTEGRATES or min(slowest) > SETTLES:
+        return linear
+    alike = (t for t in linear if t.against == best.against and nats(problem, t, best) <= NATS)
+    settling = next((t for t in alike if all(_slowest(t, fold) <= INTEGRATES for fold in t.folds)), None)
+    return linear if settling is None else [settling, *(t for t in linear if t is not settling)]
 
 
 def _trained(trial: Trial) -> float:
@@ -163,8 +182,12 @@ def _with_correction(trial: Trial, correction: float) -> Trial:
 
 
 def _integrates(trial: Trial) -> bool:
-    poles = np.linalg.eigvals(trial.of_fold(trial.folds[0])[0].model.plant.a)
-    return bool(np.abs(poles).max() > INTEGRATES)
+    return _slowest(trial, trial.folds[0]) > INTEGRATES
+
+
+def _slowest(trial: Trial, fold: int) -> float:
+    """The largest magnitude of a pole of a fold's best fit."""
+    return float(np.abs(np.linalg.eigvals(trial.of_fold(fold)[0].model.plant.a)).max())
 
 
 def _curved(problem: Problem, trial: Trial) -> bool:

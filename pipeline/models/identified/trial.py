@@ -23,18 +23,19 @@ class Trial:
         """The fits of one fold, the best first.
 
         Held-out and training rows count alike: few held-out rows flatter a seed that missed others. Those that
-        contradict what is known of the plant come last.
+        contradict what is known of the plant come after these, and last those that exploded.
         """
         own = (f for (of, _), f in self.fits.items() if of == fold)
-        return sorted(own, key=lambda f: (bool(f.against), f.held_out**2 + f.trained**2))
+        return sorted(own, key=lambda f: (not np.isfinite(f.held_out), bool(f.against), f.held_out**2 + f.trained**2))
 
     @property
     def against(self) -> int:
-        """The folds of which every fit contradicts what is known of the plant.
+        """The folds of which every fit that did not explode contradicts what is known of the plant.
 
         Between none and all of them the candidate is uncertain of it.
         """
-        return sum(all(f.against for f in self.of_fold(k)) for k in self.folds)
+        finite = [[f.against for f in self.of_fold(k) if np.isfinite(f.held_out)] for k in self.folds]
+        return sum(bool(of) and all(of) for of in finite)
 
     @property
     def rank(self) -> tuple[int, float]:

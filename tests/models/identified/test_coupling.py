@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.models.identified.coupling import MOST_OPEN, sign_margin
+from pipeline.models.identified.coupling import MOST_OPEN, sign_margin, unused_answers
 from pipeline.models.identified.proof import Answer
+from pipeline.models.identified.structure import Structure
 
 CERTAIN = Answer(1.0, 0.9, 1.1, 1, 9, 1.0, 0.05)
 GAINS = np.array([[1.0, 0.3, -0.1], [-0.3, 0.8, 0.2], [0.4, -0.2, 1.0]])
@@ -66,3 +67,19 @@ def test_too_many_open_answers_or_one_without_a_number_prove_nothing() -> None:
     assert sign_margin(answers_of(gains, every), np.zeros((3, 3)), 2.0) == -np.inf
     unknown = answers_of(gains, {}) | {(0, 1): Answer(0.2, 0.1, 0.3, 1, 9)}
     assert sign_margin(unknown, np.zeros((3, 3)), 2.0) == -np.inf
+
+
+def test_answers_that_nobody_uses_are_of_the_age_of_the_others() -> None:
+    """Of slow plants the end of a curve is several times an answer of sixty rows, and the margin another."""
+    rows = np.arange(1, 1001)
+    slow = 1 - np.exp(-rows / 200)
+    unit = np.zeros((2, 1000, 2))
+    unit[0, :, 0], unit[1, :, 0], unit[1, :, 1] = slow, 0.2 * slow, slow
+    used = {(0, 0): replace(CERTAIN, model=slow[29:60].mean(), first=30, last=60)}
+    used[1, 1] = used[0, 0]
+    structure = Structure("balanced", 1, (0, 0), (0, 0))
+    found = unused_answers(used, unit, structure, (2, 2))
+    assert found[0, 1] == pytest.approx(0.2 * slow[29:60].mean())
+    assert found[0, 0] == found[1, 1] == found[1, 0] == 0
+    late = unused_answers(used, unit, replace(structure, delays=(0, 10)), (2, 2))
+    assert late[0, 1] == pytest.approx(0.2 * slow[19:50].mean())
