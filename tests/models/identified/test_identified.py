@@ -59,7 +59,7 @@ def test_its_file_brings_back_the_same_model(tmp_path: Path, n_hidden: int) -> N
     again = Identified.from_arrays(model.config(), arrays)
     z = torch.ones(6, dtype=torch.float64)
     assert torch.equal(again(z), model(z))
-    assert again.config() == {"n_y": 2, "n_mv": 1, "n_dv": 1, "n_x": 4, "n_hidden": n_hidden}
+    assert again.config() == {"n_y": 2, "n_mv": 1, "n_dv": 1, "n_x": 4, "n_hidden": n_hidden, "recorded": 0}
 
 
 def test_a_rest_has_the_outputs_that_were_asked_for() -> None:
