@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.closed_loop import STEP_BAND, last_half, swings
+from pipeline.evaluation.closed_loop import STEP_BAND, swings
 from pipeline.evaluation.law_evidence import Cycle
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import Trajectory
@@ -21,12 +21,12 @@ NOISES: Final = 5.0  # standard deviations of the noise: a smaller swing of a CV
 def cycle_of(case: Case, test: Scenario, loop: Trajectory) -> Cycle | None:
     """The limit cycle of a loop without noise, by the signal that goes farthest beyond its limit; None without one.
 
-    Over the last half of the last hold a CV goes from one side of its set point to the other, or an MV of its mean, as
-    ``swings`` counts. The limit of a CV is ``STEP_BAND`` of the span of the case's set points, within which a step
-    counts as settled, and no less than ``NOISES`` of its noise; that of an MV is ``MV_SWING`` of its range. An MV of a
-    few allowed values has to swing and does not count.
+    Over the last half of what comes after the last move of a set point or a disturbance a CV goes from one side of its
+    set point to the other, or an MV of its mean, as ``swings`` counts. The limit of a CV is ``STEP_BAND`` of the span
+    of the case's set points, within which a step counts as settled, and no less than ``NOISES`` of its noise; that of
+    an MV is ``MV_SWING`` of its range. An MV of a few allowed values has to swing and does not count.
     """
-    n, half = test.sp.shape[1], last_half(loop.sp)
+    n, half = test.sp.shape[1], _at_last(test)
     limits = np.maximum(STEP_BAND * case.asked, NOISES * case.noise_std[:n])
     found = _beyond(case.plant.sp_signals, (loop.pv[:, :n] - loop.sp)[half], limits, case.plant.period_s)
     mvs = [i for i, s in enumerate(case.plant.mv_signals) if s.values is None]
@@ -35,6 +35,14 @@ def cycle_of(case: Case, test: Scenario, loop: Trajectory) -> Cycle | None:
     ranges = np.array([s.high - s.low for s in signals])
     found += _beyond(signals, moved - moved.mean(axis=0), MV_SWING * ranges, case.plant.period_s)
     return max(found, key=lambda one: one.times, default=None)
+
+
+def _at_last(test: Scenario) -> slice:
+    """The last half of the samples after the last move of a set point, a load or a measured disturbance."""
+    courses = [test.sp, *(course[:, None] for course in test.changes.values()), *([] if test.dv is None else [test.dv])]
+    moved = [np.flatnonzero(np.any(np.diff(course, axis=0) != 0, axis=1)) for course in courses]
+    last = max((int(of[-1]) + 1 for of in moved if len(of)), default=0)
+    return slice((last + len(test.sp)) // 2, None)
 
 
 def _beyond(signals: Sequence[Signal], about: Array, limits: Array, period_s: float) -> list[Cycle]:

@@ -29,8 +29,9 @@ def follows(u: Array, y: Array, run: Runs) -> float:
     """Share of the variance of u(k) - u(k-1) that y(k) and the rows before explain beyond u's own past: feedback.
 
     Both (n,); 0 where the input never moves. Of a plant that answers within the row, what y(k-1) and the rows before
-    explain.
+    explain. Rows without a reading end a run.
     """
+    u, y, run = _read(u, y, run)
     with_row, earlier = _shares(np.diff(u, prepend=u[:1]), u, y, run)
     return earlier if with_row > 2 * earlier and not _opposes(u, y, run) else with_row
 
@@ -42,16 +43,22 @@ def fed_back(u: Array, y: Array, run: Runs) -> bool:
     the controller does in all other rows. An MV that mostly stands still follows nothing.
     """
     for column in u.T:
-        move = np.diff(column, prepend=column[:1])
-        typical = float(np.median(np.abs(move)))
-        if typical <= 1e-9 * float(np.ptp(column)):
-            continue
-        clipped = np.clip(move, -CLIPPED * typical, CLIPPED * typical)
         for pv in y.T:
-            with_row, earlier = _shares(clipped, column, pv, run)
-            if earlier > FED_BACK or (with_row > FED_BACK and _opposes(column, pv, run)):
+            own, seen, part = _read(column, pv, run)
+            move = np.diff(own, prepend=own[:1])
+            if not len(own) or (typical := float(np.median(np.abs(move)))) <= 1e-9 * float(np.ptp(own)):
+                continue
+            clipped = np.clip(move, -CLIPPED * typical, CLIPPED * typical)
+            with_row, earlier = _shares(clipped, own, seen, part)
+            if earlier > FED_BACK or (with_row > FED_BACK and _opposes(own, seen, part)):
                 return True
     return False
+
+
+def _read(u: Array, y: Array, run: Runs) -> tuple[Array, Array, Runs]:
+    """The rows in which both were read, and the runs that the others part."""
+    good = np.isfinite(u) & np.isfinite(y)
+    return u[good], y[good], (run + np.cumsum(~good))[good]
 
 
 def _shares(move: Array, u: Array, y: Array, run: Runs) -> tuple[float, float]:

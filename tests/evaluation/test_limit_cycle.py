@@ -82,3 +82,17 @@ def test_an_own_plant_settles_by_the_span_of_its_set_points_and_no_less_than_the
     assert case.score(test, loop.pv + 0.9 * RANGE_BAND * case.spans, loop.mv)["settling"] == 0
     swinging = replace(loop, pv=loop.pv + 0.012 * case.spans * np.cos(np.pi * np.arange(len(loop.sp)))[:, None])
     assert swings_on(case, test, swinging)
+
+
+def test_what_a_load_that_steps_back_starts_is_no_limit_cycle_if_it_dies_out(case: OwnCase) -> None:
+    """The set point rests all the time; what counts begins after the last move of anything."""
+    loop, test = resting(case), case.scenarios()["load"][0]
+    n = len(loop.sp)
+    k = np.arange(n) - n // 2
+    course = np.where(k < 0, 1.0, 0.0)
+    dies_out = np.where(k >= 0, np.cos(2 * np.pi * k / PERIOD) * np.exp(-np.maximum(k, 0) / (0.06 * n)), 0.0)[:, None]
+    swinging = replace(loop, pv=loop.pv + dies_out)
+    stepped = replace(test, changes={**test.changes, next(iter(test.changes)): course})
+    assert cycle_of(case, replace(test, changes={}), swinging) is not None
+    assert cycle_of(case, stepped, swinging) is None
+    assert cycle_of(case, replace(test, changes={}, dv=course[:, None]), swinging) is None

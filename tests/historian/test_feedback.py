@@ -48,3 +48,14 @@ def test_a_controller_alone_explains_all_its_moves() -> None:
     share, back = in_one_run(u, y)
     assert share > 0.95
     assert back
+
+
+@pytest.mark.parametrize("lost", [(0, 40), (700, 300), (2_300, 100), (0, 2_400)])
+def test_rows_without_a_reading_end_a_run(lost: tuple[int, int]) -> None:
+    """As in a file before it is cleaned: the command then ended in a solver's words."""
+    y, u, _ = OperatedLoop(2.0, dead=3, kc=0.5, ti=10.0).rows(2_400, 1)
+    for of in (y, u):
+        spoilt = of.copy()
+        spoilt[lost[0] : sum(lost)] = np.nan
+        share, back = in_one_run(*((u, spoilt) if of is y else (spoilt, y)))
+        assert (share > 0.95, back) == (lost[1] < 2_400, lost[1] < 2_400)

@@ -18,7 +18,7 @@ TRAVEL = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
 NEAR = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it
 COARSE = [(s, c) for s in (0.5, 1.0, 2.0) for c in (0.4, 1.0, 2.5)]  # factors of speed and caution
 FINE = [(s, c) for s in (0.7, 1.0, 1.4) for c in (0.6, 1.0, 1.6)]
-CALM = 0.02  # of the least error, that less travel may cost: a valve wears, and the model is not the plant
+CALM = 0.05  # of the least error, that less travel may cost: a valve wears, and the model is not the plant
 HORIZONS = (0.7, 1.3)
 JUMPS = (0.3, 0.1, 0.03)
 DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
@@ -75,8 +75,7 @@ def judged(outcome: Outcome, given: Outcome, numbers: Sequence[Numbers]) -> list
 def calmest(tried: Sequence[Candidate]) -> Candidate:
     """Of the numbers whose error is at most ``CALM`` more than the least, those of the least travel.
 
-    On the plant less travel costs several times the error that it costs on the model: 5 % of J, its travel counted
-    twice, cost 6 to 20 % on plants in records that wander.
+    The travel is not in the limit: counted there too, it cost several times these 5 % on plants whose loads wander.
     """
     limit = (1 + CALM) * min(c.error for c in tried)
     return min((c for c in tried if c.error <= limit), key=lambda c: (c.travel, c.error))
