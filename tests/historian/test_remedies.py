@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -71,5 +72,6 @@ def test_the_table_of_tags_has_the_smallest_difference_and_the_share_of_modes(tm
     assert [found[name].step for name in HEADER[1:]] == [0.001, 0.1, 0.01]
     assert (found["A.MODE"].step, found["A.MODE"].good) == (0.0, 1.0)
     write_tags(tmp_path / "tags.csv", found.values())
-    table = (tmp_path / "tags.csv").read_text().splitlines()
-    assert table[-1].startswith("A.MODE,mode,A.MODE,,,,,,,,,,,100.00,")
+    table = list(csv.DictReader((tmp_path / "tags.csv").read_text().splitlines()))
+    row = {column: value for column, value in table[-1].items() if value and column != "remark"}
+    assert row == {"tag": "A.MODE", "role": "mode", "name": "A.MODE", "loop": "A", "good_percent": "100.00"}
