@@ -13,7 +13,7 @@ from pipeline.evaluation.case import Array
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
-from pipeline.simulation.rests import RESTING, balanced, courses, inside, settled
+from pipeline.simulation.rests import BALANCED, RESTING, balanced, courses, inside, settled
 from serving.manifest import Signal
 
 VISITED_MV, VISITED_CV = (0.1, 0.9), (0.01, 0.99)  # quantiles of the record between which tests move
@@ -25,7 +25,6 @@ MOVING = 0.05  # of the CV's visited range in the last quarter of RESTING: a CV 
 TIMES, HOLD = 3, (30, 400)  # a set point lasts so many times as long as an answer; the fewest and most samples
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2, 0.1)  # of the distance of drawn MVs from their medians
 INWARD = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the way from the visited range's middle to its end: where a rest is tried
-BALANCED = 1e-6  # largest residual of a balance
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ class Stated:
 
 
 def stated_of(tags: Sequence[Tag], options: Sequence[str]) -> Stated:
-    """What the table and the options say of ``tags``, which have names.
+    """The statements of the table and the options on ``tags``, which have names.
 
     TableError with all mistakes of the table, RecordError for one of the options and for what contradicts itself.
     """

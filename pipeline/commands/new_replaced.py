@@ -47,7 +47,7 @@ def limits_kept(plant: str, tags: Sequence[Tag]) -> tuple[tuple[Tag, ...], list[
 
 
 def known_kept(plant: str, said: Stated, tags: Sequence[Tag]) -> tuple[tuple[Known, ...], list[str]]:
-    """What is known of pairs, with what params.yaml has of pairs that are still there, and the latter in words.
+    """The statements on pairs, with those of params.yaml on pairs that are still there, and the latter in words.
 
     A statement on a pair that a person gives anew prevails as a whole.
     """

@@ -1,4 +1,4 @@
-"""What an engineer knows of a pair of PV and input: sign, none, gain, dead time; ``plants.<name>.known``."""
+"""Knowledge of an engineer on a pair of PV and input: sign, none, gain, dead time; ``plants.<name>.known``."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Known:
         return not (low - least <= gain + SURE * sd and gain - SURE * sd <= high + least)
 
     def question(self, gain: float, sd: float) -> str:
-        """What to ask where a record is certain of another gain."""
+        """The question where a record is certain of another gain."""
         return (
             f"{self.pair}: {self.says!r} is said, and the record is certain of {gain:.3g} ± {sd:.2g}: is a tag turned "
             "round, or the statement?"
@@ -102,7 +102,7 @@ class Known:
 
 
 def stated(pv: str, given: str, text: str) -> Known:
-    """What a text such as ``+, gain 0.5..2, dead 30..60`` says of a pair; ValueError for another form."""
+    """The statement of a text such as ``+, gain 0.5..2, dead 30..60`` on a pair; ValueError for another form."""
     found: dict[str, Any] = {}
     for part in re.split(r"\s*,(?!\d)\s*", text.strip()):  # 0,5 is a decimal comma
         match = PART.match(part)

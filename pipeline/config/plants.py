@@ -108,7 +108,7 @@ def mistakes_of_mv(mv: Commanded) -> list[str]:
 def mistake_of_known(
     known: Sequence[Known], pvs: Sequence[str], mvs: Sequence[str], dvs: Sequence[str], controlled: int
 ) -> str:
-    """What cannot be in the statements on pairs of a plant's signals, a sentence; empty where nothing is wrong.
+    """A mistake in the statements on pairs of a plant's signals, a sentence; empty where nothing is wrong.
 
     A controlled PV needs an MV that moves it, and an MV that moves none of them is no MV.
     """

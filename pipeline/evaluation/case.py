@@ -194,7 +194,7 @@ class Case(ABC):
 
     @property
     def spans(self) -> Array:
-        """What small errors of each CV are shares of, (n_cv,): of settling, of swings, of steps too small to count."""
+        """Widths (n_cv,) of which small errors are shares: of settling, of swings, of steps too small to count."""
         return self.asked
 
     @property

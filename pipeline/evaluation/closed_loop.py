@@ -149,11 +149,12 @@ def left_limits(pv: ArrayLike, *, low: ArrayLike, high: ArrayLike) -> bool:
     return bool(np.any((y < bottom - room) | (y > top + room)))
 
 
-def last_half(sp: Array) -> slice:
-    """The last half of the last hold of set points (n, n_cv): of the samples since one of them last moved."""
-    moved = np.flatnonzero(np.any(np.diff(sp, axis=0) != 0, axis=1))
-    start = int(moved[-1]) + 1 if len(moved) else 0
-    return slice((start + len(sp)) // 2, len(sp))
+def last_half(*courses: Array) -> slice:
+    """The last half of the samples since any of these last moved: set points, loads, disturbances (n,) or (n, k)."""
+    n = len(courses[0])
+    moved = [np.flatnonzero(np.diff(course.reshape(n, -1), axis=0).any(axis=1)) for course in courses]
+    start = max((int(of[-1]) + 1 for of in moved if len(of)), default=0)
+    return slice((start + n) // 2, n)
 
 
 def swings(sp: Array, cv: Array, span: Array, share: float = SWING, *, whole: bool = False) -> NDArray[np.bool_]:

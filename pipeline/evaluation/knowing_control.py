@@ -1,4 +1,4 @@
-"""What a control that knows the plant of a test exactly gets to within a hold: what no law can be asked to beat.
+"""The reach of a control that knows the plant of a test exactly, within a hold: no law can be asked to beat it.
 
 A set point of a spoilt plant may be out of reach within its hold, wherever the MVs go. So simple courses of the MVs are
 tried, each to its end: constant ones, and an end of the MVs' ranges that gives way to the MVs that rest at the set
@@ -17,10 +17,9 @@ import numpy as np
 from pipeline.evaluation.closed_loop import FAR, holds
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import Array
-from pipeline.simulation.rests import balanced, inside
+from pipeline.simulation.rests import BALANCED, balanced, inside
 from pipeline.simulation.scenario import Scenario
 
-BALANCED = 1e-6  # largest residual of a rest
 FINE, COARSE = 9, 3  # constant values of one MV, and of each of several
 TOGETHER = 3  # most MVs of which all combinations are tried
 SWITCHES = (0.03, 0.06, 0.12, 0.25, 0.4, 0.6)  # of the hold; another switch is where a CV reaches its set point
@@ -28,7 +27,7 @@ SWITCHES = (0.03, 0.06, 0.12, 0.25, 0.4, 0.6)  # of the hold; another switch is 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reached:
-    """What the best of the courses comes to: whether each CV is near its set point at some time in the second half."""
+    """The best of the courses: whether each CV is near its set point at some time in the second half."""
 
     near: bool
     x: Array  # (n_x,) at the end of the hold

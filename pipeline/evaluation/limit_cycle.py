@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.closed_loop import STEP_BAND, swings
+from pipeline.evaluation.closed_loop import STEP_BAND, last_half, swings
 from pipeline.evaluation.law_evidence import Cycle
 from pipeline.simulation.scenario import Scenario
 from pipeline.simulation.simulate import Trajectory
@@ -26,7 +26,8 @@ def cycle_of(case: Case, test: Scenario, loop: Trajectory) -> Cycle | None:
     of the case's set points, within which a step counts as settled, and no less than ``NOISES`` of its noise; that of
     an MV is ``MV_SWING`` of its range. An MV of a few allowed values has to swing and does not count.
     """
-    n, half = test.sp.shape[1], _at_last(test)
+    n, measured = test.sp.shape[1], [] if test.dv is None else [test.dv]
+    half = last_half(test.sp, *test.changes.values(), *measured)
     limits = np.maximum(STEP_BAND * case.asked, NOISES * case.noise_std[:n])
     found = _beyond(case.plant.sp_signals, (loop.pv[:, :n] - loop.sp)[half], limits, case.plant.period_s)
     mvs = [i for i, s in enumerate(case.plant.mv_signals) if s.values is None]
@@ -35,14 +36,6 @@ def cycle_of(case: Case, test: Scenario, loop: Trajectory) -> Cycle | None:
     ranges = np.array([s.high - s.low for s in signals])
     found += _beyond(signals, moved - moved.mean(axis=0), MV_SWING * ranges, case.plant.period_s)
     return max(found, key=lambda one: one.times, default=None)
-
-
-def _at_last(test: Scenario) -> slice:
-    """The last half of the samples after the last move of a set point, a load or a measured disturbance."""
-    courses = [test.sp, *(course[:, None] for course in test.changes.values()), *([] if test.dv is None else [test.dv])]
-    moved = [np.flatnonzero(np.any(np.diff(course, axis=0) != 0, axis=1)) for course in courses]
-    last = max((int(of[-1]) + 1 for of in moved if len(of)), default=0)
-    return slice((last + len(test.sp)) // 2, None)
 
 
 def _beyond(signals: Sequence[Signal], about: Array, limits: Array, period_s: float) -> list[Cycle]:

@@ -114,17 +114,12 @@ def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array 
     return simulate_closed(plant, step, test, noise=noise, seed=seed)
 
 
-def stuck(case: Case, test: Scenario, loop: Trajectory) -> bool:
-    """Whether the loop locked up at an end of an MV, or the controller refused a step.
-
-    A controller refuses to give an MV beyond its range. Where the tests run on models, a CV far beyond its range counts
-    too: equations hold far from where they were meant, a model of a record does not.
-    """
-    return seized(case, test, loop)[0]
-
-
 def seized(case: Case, test: Scenario, loop: Trajectory) -> tuple[bool, int]:
-    """(whether the loop is ``stuck``, holds in which it is at an end because its set point is beyond reach).
+    """(whether the loop locked up, holds in which it is at an end because its set point is beyond reach).
+
+    It locks up at an end of an MV, or where the controller refused a step: one refuses to give an MV beyond its range.
+    Where the tests run on models, a CV far beyond its range counts too: equations hold far from where they were meant,
+    a model of a record does not.
 
     On a model of a record a hold counts only where a control that knows the model comes near the set point within the
     hold, from the same state: a plant gone wrong may not get there at all.

@@ -15,6 +15,7 @@ STILL = 1e-7  # of the largest state: a change in one period that is none
 BROKEN = 1e9  # a state beyond it belongs to a plant that runs away
 CHANGE = 1e-6  # of a state or of an MV's range: for slopes
 NEWTON = 12  # iterations
+BALANCED = 1e-6  # largest residual of a balance that was found
 STEP = 0.02  # of an MV's range: for local gains
 MOVING = 0.2  # of a difference, over RESTING periods at its late rate: a CV that moves more does not settle
 WEAK = 1e-7  # of the largest slope: a direction in which nothing is decided

@@ -14,7 +14,7 @@ from pipeline.cases import own_plant
 from pipeline.cases.own_model import lessened
 from pipeline.cases.own_plant import OwnCase
 from pipeline.evaluation.knowing_control import gets_there, reached
-from pipeline.evaluation.trial import close_loop, repeated, seized, stuck
+from pipeline.evaluation.trial import close_loop, repeated, seized
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.simulation.scenario import Scenario, held
 
@@ -103,7 +103,7 @@ def test_where_tests_run_on_equations_every_such_hold_counts(monkeypatch: pytest
     monkeypatch.setattr(type(case), "on_models", False)
     full = a_test(case, [1.9], time_constant=100.0)
     loop = close_loop(AtEnd(1.0), case, full, None, 0)  # type: ignore[arg-type]
-    assert stuck(case, full, loop)
+    assert seized(case, full, loop)[0]
 
 
 def test_errors_that_no_control_copes_with_are_lessened_and_the_title_says_so(

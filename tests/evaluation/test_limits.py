@@ -14,7 +14,7 @@ from own_cases import filled_level
 from pipeline.cases import CASES
 from pipeline.cases.own_plant import OwnCase
 from pipeline.evaluation.closed_loop import LEFT, left_limits, locked_up
-from pipeline.evaluation.trial import close_loop, repeated, stuck
+from pipeline.evaluation.trial import close_loop, repeated, seized
 from serving.controller import Controller
 from serving.errors import LoopwrightError
 
@@ -72,7 +72,7 @@ def test_the_swinging_loop_is_no_lock_up(level: OwnCase) -> None:
     loop = close_loop(cast(Controller, Told(swinging)), level, test, None, 0)
     assert not locked_up(loop.sp, loop.pv, loop.mv, test.hold, low=[-1.0], high=[1.0], span=[6.0])
     assert np.abs(loop.pv).max() > 3 + LEFT * 6
-    assert stuck(level, test, loop)
+    assert seized(level, test, loop)[0]
 
 
 def test_the_range_may_be_overshot_a_little() -> None:

@@ -12,7 +12,7 @@ import pytest
 from pipeline.cases import CASES
 from pipeline.evaluation import trial, trials
 from pipeline.evaluation.case import Case, Curve, Figure
-from pipeline.evaluation.trial import DRAW, close_loop, repeated, stuck, swings_on
+from pipeline.evaluation.trial import DRAW, close_loop, repeated, seized, swings_on
 from pipeline.evaluation.trials import try_files
 from serving.errors import OutputError
 
@@ -87,19 +87,19 @@ def test_a_refused_step_keeps_the_mv_and_counts_as_a_lock_up(case: Case) -> None
     assert loop.mv[12] == loop.mv[11]
     assert loop.info[:, -1].tolist() == [float(k == 12) for k in range(test.samples)]
     assert loop.info[13, 1] == 0  # it started afresh
-    assert stuck(case, test, loop)
+    assert seized(case, test, loop)[0]
     sound: Any = Proportional()
-    assert not stuck(case, test, close_loop(sound, case, test, None, 0))
+    assert not seized(case, test, close_loop(sound, case, test, None, 0))[0]
 
 
 def test_a_loop_at_its_limit_is_locked_up_and_a_start_up_is_not(case: Case) -> None:
     test = case.scenarios()["trajectory"][0]
     cold: Any = Proportional(gain=-1.0)  # the wrong way: full cooling for ever
-    assert stuck(case, test, close_loop(cold, case, test, None, 0))
+    assert seized(case, test, close_loop(cold, case, test, None, 0))[0]
     hard: Any = Proportional(gain=1.0)  # full heating for 8 samples, then near the profile
     loop = close_loop(hard, case, test, None, 0)
     assert (loop.mv[:7] == 1).all()
-    assert not stuck(case, test, loop)
+    assert not seized(case, test, loop)[0]
 
 
 def test_a_loop_that_swings_to_the_end_is_no_lock_up_and_is_told(case: Case) -> None:

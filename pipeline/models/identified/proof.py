@@ -67,9 +67,9 @@ class Answer:
         """
         told = [region for region in self.regions if not region.small]
         against = [r.answer.verdict for r in told if r.answer.verdict in {OPPOSITE, HALVES}]
-        if self._of_all == PROVEN and against:
-            return against[0]
-        if self._of_all == PROVEN or not told or any(r.answer.verdict not in {PROVEN, UNCERTAIN} for r in told):
+        if self._of_all == PROVEN:
+            return against[0] if against else PROVEN
+        if not told or any(r.answer.verdict not in {PROVEN, UNCERTAIN} for r in told):
             return self._of_all
         return TURNS if min(r.answer.model for r in told) < 0 < max(r.answer.model for r in told) else FADES
 
