@@ -60,6 +60,8 @@ def resampled(
     period_s: float,
     hold_s: float | None = None,
     done: Callable[[str], None] = lambda _: None,
+    *,
+    sampled: bool = False,
 ) -> tuple[Grid, tuple[Sampling, ...]]:
     """All series on one grid: PVs and measured disturbances (``pv``) drawn or averaged, the others held.
 
@@ -72,16 +74,20 @@ def resampled(
     Held ones: the reading that holds at the middle between t and the next row, so that jitter of less than half a
     period does not matter; the mean over it where they are thinned out. ``done`` is called with each tag
     whose readings are needed no more.
+    ``sampled``, for MVs that follow the PVs: no means, but what a controller of that period sees and does at the row's
+    own time. The mean of an MV holds what a controller did because of the PV's noise within that row; a model takes it
+    for the plant's answer, and starts the wrong way.
     """
     if not period_s > 0:
         raise RecordError(f"the period is {period_s:g} s; it must be positive")
     rates = {s.tag: sampling(s, period_s, hold_s) for s in (*pv, *held)}
     time_s, piece, step_s = _times(pv, period_s, max(rates[s.tag].hold_s for s in pv))
-    middle = time_s + 0.5 * np.minimum(np.diff(time_s, append=np.inf), period_s)
+    scan_s = min((period_s, *(rates[s.tag].step_s for s in pv if rates[s.tag].step_s))) if sampled else period_s
+    middle = time_s + 0.5 * np.minimum(np.diff(time_s, append=np.inf), scan_s)
     value, code, bridged = {}, {}, {}
     for s in (*pv, *held):
         rate = rates[s.tag]
-        thin = 0 < rate.step_s * THINNED <= period_s and not s.categories and not rate.irregular
+        thin = not sampled and 0 < rate.step_s * THINNED <= period_s and not s.categories and not rate.irregular
         if s in pv and thin:
             out, over = _mean(time_s, *_good(s), period_s, 0.5 * step_s)
         elif thin:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
-from pipeline.historian.excerpt import SEEN
+from pipeline.historian.excerpt import readings_of
 from pipeline.historian.export import Series
+from pipeline.historian.feedback import fed_back
 from pipeline.historian.findings import Finding
 from pipeline.historian.grid import resampled
 from pipeline.historian.linear import Linear, fitted
@@ -23,7 +24,6 @@ from pipeline.metrics import Array
 MOST_PERIODS, WANTED, LEAST_PERIODS = 60, 40, 28  # in which a plant settles: the longest look ahead, and what is usual
 FINE = 240  # periods up to which an export keeps its step, where its rows as they are show the settling
 FAST, A_HOLD = 4, 3  # periods that the fastest answer, and a hold of an MV, still have
-WINDOWS = 4  # of a long export
 FACTORS = (1, 3, 10, 30, 100, 300, 1000)  # by which the rows are thinned out
 LEAST_ROWS = 200  # of a fit
 RESOLVED = 8  # rows from which an answer's settling is known well enough
@@ -48,7 +48,7 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """The clear answers of a plant, and how long its MVs are usually held.
+    """The clear answers of a plant, how long its MVs are usually held, and whether these follow its PVs.
 
     Only ``answers`` decide anything; ``uncertain`` are those whose settling time another model does not confirm.
     """
@@ -56,6 +56,7 @@ class Pace:
     answers: tuple[Answer, ...] = ()
     hold_s: float = np.inf  # [s] the shortest usual one
     uncertain: tuple[Answer, ...] = ()
+    fed_back: bool = False  # by the readings: rows averaged from them may hide it
 
     @property
     def slowest(self) -> Answer | None:
@@ -101,6 +102,7 @@ def of_period(pace: Pace, period_s: float, step_s: float, *, given: bool) -> lis
     if period_s <= step_s:
         return []
     words = f"one row every {period_s:g} s: it {settles}, and the export has a reading every {step_s:g} s"
+    words += ", of which the rows are samples and no means, for MVs follow PVs" * pace.fed_back
     return [Finding("period", slowest.pv, words + "; --period says another" * (not given))]
 
 
@@ -133,7 +135,7 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
     No answer where the readings give no rows.
     """
     pv, mv, dv = ([series[t.tag] for t in tags if t.role == role] for role in ("pv", "mv", "dv"))
-    cut = _excerpt(pv, (*pv, *mv, *dv), step_s)
+    cut = readings_of(pv, (*pv, *mv, *dv), step_s)
     try:
         grid, rates = resampled([cut[s.tag] for s in (*pv, *dv)], [cut[s.tag] for s in mv], step_s)
     except RecordError:  # of the record's own rows, whose period a person may have given, it is raised again
@@ -143,12 +145,14 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
     known = {tag: grid.known(tag) for tag in grid.value}
     names, inputs = [s.tag for s in pv], [s.tag for s in (*mv, *dv)]
     spans = np.array([_span(known[tag]) for tag in inputs])
+    u, y = (np.column_stack([known[s.tag] for s in group]) for group in (mv, pv))
+    back = fed_back(u, y, grid.piece)
     found: dict[tuple[str, str], list[tuple[int, bool, float]]] = {}
     thinned: dict[int, tuple[dict[str, Array], NDArray[np.int64]]] = {}
     for factor in FACTORS:
         if factor > 1 and len(grid) < factor * LEAST_ROWS:
             break
-        thinned[factor] = value, run = _thinned(known, grid.piece, {s.tag for s in mv}, factor)
+        thinned[factor] = value, run = _thinned(known, grid.piece, {s.tag for s in mv}, factor, back)
         for name in names:
             model = fitted(value[name], [value[tag] for tag in inputs], run)
             if model is not None:
@@ -166,31 +170,16 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
             sure = i in certain(value[name], u, run, {i: rows}) if kind else grows(value[name], u, run, i)
             answers[sure].append(Answer(name, moved, n * step_s, shown))
     hold = min((_hold(known[s.tag], grid.piece) for s in mv), default=np.inf) * step_s
-    return Pace(tuple(answers[True]), hold, tuple(answers[False]))
-
-
-def _excerpt(clock: Sequence[Series], series: Sequence[Series], step_s: float) -> dict[str, Series]:
-    """The series, of a long export WINDOWS stretches of their time, each of SEEN / WINDOWS steps."""
-    length = SEEN / WINDOWS * step_s
-    first, last = (f(float(s.time_s[i]) for s in clock) for f, i in ((min, 0), (max, -1)))
-    if last - first <= 1.5 * WINDOWS * length:
-        return {s.tag: s for s in series}
-    starts = np.linspace(first, last - length, WINDOWS)
-
-    def cut(s: Series) -> Series:
-        ends = [np.searchsorted(s.time_s, (a, a + length)) for a in starts]
-        time_s, value, code = (np.concatenate([c[a:b] for a, b in ends]) for c in (s.time_s, s.value, s.code))
-        return replace(s, time_s=time_s, value=value, code=code)
-
-    return {s.tag: cut(s) for s in series}
+    return Pace(tuple(answers[True]), hold, tuple(answers[False]), back)
 
 
 def _thinned(
-    value: dict[str, Array], piece: NDArray[np.int64], held: set[str], factor: int
+    value: dict[str, Array], piece: NDArray[np.int64], held: set[str], factor: int, sampled: bool
 ) -> tuple[dict[str, Array], NDArray[np.int64]]:
-    """Values (m,) of tags, (n,) each, by ``factor`` rows, and the pieces (m,): means, as ``resampled`` takes them.
+    """Values (m,) of tags, (n,) each, by ``factor`` rows, and the pieces (m,): as ``resampled`` takes them.
 
-    Row k has what is ``held`` from its time on, and the others up to its time.
+    Row k has the means of what is ``held`` from its time on, and of the others up to its time; all at its own time
+    where they are ``sampled``.
     """
     if factor == 1:
         return value, piece
@@ -198,6 +187,8 @@ def _thinned(
     row = np.flatnonzero(place % factor == factor - 1)
     row = row[row + factor <= len(piece)]
     row = row[piece[row + factor - 1] == piece[row]]
+    if sampled:
+        return {tag: v[row] for tag, v in value.items()}, piece[row]
     return {tag: _means(v, row if tag in held else row - factor + 1, factor) for tag, v in value.items()}, piece[row]
 
 

@@ -115,7 +115,7 @@ def screened(
         if role_of[tag] not in {"pv", "mv"}:
             let_go(tag)
 
-    grid, rates = resampled(drawn, held, period, hold_s, resampled_one)
+    grid, rates = resampled(drawn, held, period, hold_s, resampled_one, sampled=pace.fed_back)
     by_tag = {r.tag: r for r in rates}
     signals = [t for t in tags if t.role in {"pv", "mv", "dv"}]
     findings += of_left_out(leave_out, flag_rows(grid, [t.tag for t in signals], spans, Reason.LEFT_OUT))
@@ -132,7 +132,7 @@ def screened(
     findings += inputs_and_answers(grid, signals)
     findings += [f for t in tags if t.role == "mode" for f in of_mode(own[t.tag], grid.value[t.tag])]
     code = row_codes(grid, signals, tags, own, without_modes)
-    record = record_of(grid, code, signals)
+    record = replace(record_of(grid, code, signals), fed_back=pace.fed_back)
     excerpt = evenly(record)
     models = models_of(excerpt)
     moved = max(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
@@ -19,6 +19,7 @@ from serving.manifest import Signal
 
 STEP_TOLERANCE = 1e-3  # of the period: what a logger's rounded time stamps may stray
 MV_TOLERANCE = 1e-9  # of a signal's span
+FED_BACK = "fed_back"  # name in a Parquet file's metadata
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +38,7 @@ class Record:
     pv: Array  # (N, n_pv)
     mv: Array  # (N, n_mv)
     dv: Array  # (N, n_dv)
+    fed_back: bool = False  # its readings show that an MV follows a PV, which rows averaged from them may hide
 
     def __post_init__(self) -> None:
         n = len(self.run)
@@ -103,7 +105,8 @@ class Record:
         columns |= dict(zip(self.columns, (*self.pv.T, *self.mv.T, *self.dv.T), strict=True))
         signals = {"pv": self.pv_signals, "mv": self.mv_signals, "dv": self.dv_signals}
         described = {kind: [s.to_dict() for s in group] for kind, group in signals.items()}
-        write_table(path, columns, {"period_s": self.period_s, **described})
+        told = {FED_BACK: True} if self.fed_back else {}
+        write_table(path, columns, {"period_s": self.period_s, **described, **told})
 
     @classmethod
     def read(cls, path: Path, signals: Signals) -> Self:
@@ -130,7 +133,8 @@ class Record:
         for signal, values in zip(signals.mv, mv.T, strict=True):
             check_mv(table, signal, values)
         # ``of`` puts times on the exact grid, so that a file's rounded time stamps do not change the digest.
-        return cls.of(signals, pv, mv, run=runs.astype(np.int64), dv=dv)
+        found = cls.of(signals, pv, mv, run=runs.astype(np.int64), dv=dv)
+        return replace(found, fed_back=bool(table.told.get(FED_BACK)))
 
 
 def position_in_run(run: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,7 @@ class Table:
     header: tuple[str, ...]
     cells: tuple[NDArray[Any], ...]  # one array of shape (rows,) a column
     first_row: int  # the number by which a person knows the first row
+    told: Mapping[str, Any] = field(default_factory=dict)  # what ``write_table`` was told besides the columns
 
     @property
     def rows(self) -> int:
@@ -141,7 +142,8 @@ def _reader(path: Path) -> Callable[[Path], Table]:
 def _read_parquet(path: Path) -> Table:
     table = pq.read_table(path)
     cells = tuple(table.column(i).to_numpy() for i in range(table.num_columns))
-    return Table(path, tuple(table.column_names), cells, first_row=0)
+    told = json.loads((table.schema.metadata or {}).get(METADATA_KEY, b"{}"))
+    return Table(path, tuple(table.column_names), cells, first_row=0, told=told)
 
 
 def _read_csv(path: Path) -> Table:

@@ -111,6 +111,14 @@ def test_parquet_carries_signals_units_and_period(tmp_path):
     assert '"unit": "mol/l"' in metadata
 
 
+@pytest.mark.parametrize("back", [False, True])
+def test_parquet_carries_whether_the_readings_showed_feedback(tmp_path, back):
+    record = dataclasses.replace(make([3]), fed_back=back)
+    record.write(tmp_path / "r.parquet")
+    assert Record.read(tmp_path / "r.parquet", PLANT).fed_back is back
+    assert record.digest() == make([3]).digest()
+
+
 def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "r.csv"
     make([3]).write(path)

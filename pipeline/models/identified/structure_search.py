@@ -48,7 +48,7 @@ class StructureSearch(Groundwork[Searched]):
         """The search over the source's record; ModelError where it cannot carry a model."""
         seen = source.data(self.kind)
         n_y, n_mv = len(source.signals.pv if self.all_measured else source.signals.sp), len(source.signals.mv)
-        back = fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
+        back = seen.fed_back or fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
         record = informative(seen, MORE * self.rows if back else self.rows)
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)

@@ -52,6 +52,13 @@ def test_members_share_one_search() -> None:
     assert PART.groundwork() not in works
 
 
+@pytest.mark.parametrize("back", [False, True])
+def test_feedback_that_the_readings_showed_decides(back: bool) -> None:
+    record = replace(made_plants.second_order(400), fed_back=back)
+    searched = replace(PART, units=()).groundwork().done(Source(record, made_plants.signals_of(1, 1)), "search")
+    assert searched.problem.fed_back is back
+
+
 def test_without_lagged_candidates_all_have_the_orders_that_are_given() -> None:
     source = Source(made_plants.second_order(400), made_plants.signals_of(1, 1))
     small = replace(PART, units=())
