@@ -165,9 +165,9 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
         if 0 < n <= most:
             factor = max((f for f, _, _ in found[name, moved] if n >= RESOLVED * f), default=1)
             value, run = thinned[factor]
-            u, i, rows = [value[tag] for tag in inputs], inputs.index(moved), max(round(n / factor), 1)
+            z, i, rows = [value[tag] for tag in inputs], inputs.index(moved), max(round(n / factor), 1)
             kind = found[name, moved][-1][1]
-            sure = i in certain(value[name], u, run, {i: rows}) if kind else grows(value[name], u, run, i)
+            sure = i in certain(value[name], z, run, {i: rows}) if kind else grows(value[name], z, run, i)
             answers[sure].append(Answer(name, moved, n * step_s, shown))
     hold = min((_hold(known[s.tag], grid.piece) for s in mv), default=np.inf) * step_s
     return Pace(tuple(answers[True]), hold, tuple(answers[False]), back)
