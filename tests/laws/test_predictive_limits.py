@@ -157,7 +157,8 @@ def test_a_limit_of_one_variable_goes_before_the_set_point_of_another(gain: floa
 
 
 def test_a_network_keeps_its_limits_too() -> None:
-    model = random_model(5, n_y=2, n_mv=2)
+    model = random_model(8, n_y=2, n_mv=2)
+    model.c.copy_(-torch.tanh(model.b1) @ model.w2.T)  # zero, where the loop starts, is a rest
     sp = np.repeat([[0.1, 0.2], [-0.1, 0.19], [0.2, 0.15]], 12, axis=0)
     free, held = (closed(law_of(model, **SMALL, cv_high=high), model, sp)[0] for high in (None, (None, 0.2)))
     assert free[:, 1].max() > 0.21

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
 from pipeline.laws.predictive.horizon import horizon_of
-from pipeline.laws.predictive.loads import loads_of
+from pipeline.laws.predictive.loads import Loads, balanced, held_rest, loads_of
 from pipeline.laws.predictive.moves import Moves
 from pipeline.laws.predictive.observer import Estimate, Noises, Observer, load_variance
 from pipeline.laws.predictive.params import PredictiveParams, check_sizes, limits_of, refuse_discrete, weights_of
@@ -41,8 +41,9 @@ class Predictive(ControlLaw):
     measured disturbances as they are. The loads make the predictions right on average, so a constant error of the
     model or a load leaves no offset; a set point out of reach ends at the nearest output. The last plan, one sample
     on, is where the next one begins. The filter reads the MV that really acted: that is the anti-windup. Without a
-    past it starts at the rest that fits the process variables and the applied MV. The set points r stay as they are,
-    or go on with their last slope. CVs may have soft limits, whose cost is added.
+    past it starts at the rest that fits the process variables and the applied MV, under the loads that hold it there:
+    on set point it asks for that MV. The set points r stay as they are, or go on with their last slope. CVs may have
+    soft limits, whose cost is added.
 
     ``Observer``, ``Horizon``, ``Planner``, ``SetPoints`` and ``SoftLimits`` hold the formulas and their sources.
     """
@@ -63,6 +64,7 @@ class Predictive(ControlLaw):
     mv_half: Tensor  # (n_mv,)
     y_center: Tensor  # (n_cv,)
     y_scale: Tensor  # (n_cv,)
+    largest: Tensor  # (n_d,) scaled load of a rest
     load_scale: Tensor  # [mv] of loads at MVs, [pv a period] of loads at outputs; of a scaled load
 
     def __init__(self, signals: Signals, model: Identified, params: PredictiveParams) -> None:
@@ -81,7 +83,6 @@ class Predictive(ControlLaw):
         damping = (0.5 if n_mv == 1 else 0.25) if params.damping is None else params.damping
         cost = Cost(weights, move, params.eps, damping)
         loads = loads_of(model, params.loads, horizon)
-        self.n_d = loads.count
         self.q_d = load_variance(model) if params.q_d is None else torch.full((model.n_y,), params.q_d).double()
         self.observer = Observer(model, loads, Noises(params.q_x, self.q_d / params.caution**2, params.jumps))
         rate = None if self.rate is None else self.rate / half
@@ -92,7 +93,8 @@ class Predictive(ControlLaw):
         self.wanted = self._set_points(model, bounds, ramp=params.preview == "ramp")
         at_mvs = loads.into_v[:n_mv].diagonal() * model.v_scale[:n_mv] if loads.at_mvs else model.y_scale[:n_cv]
         self.register_buffer("load_scale", at_mvs.clone())
-        self._build_ends(model, n_cv, middle, half)
+        self.register_buffer("largest", balanced(model, loads, 2 * half / model.v_scale[:n_mv], horizon))
+        self._build_ends(model, loads, n_cv, middle, half)
         self.info = (
             *(f"load_{s.name}" for s in (signals.mv if loads.at_mvs else signals.sp)),
             *(f"next_{s.name}" for s in signals.sp),
@@ -119,7 +121,7 @@ class Predictive(ControlLaw):
         return SetPoints(self.moves.horizon, n_cv, bounds, ramp=ramp)
 
     @torch.no_grad()
-    def _build_ends(self, model: Identified, n_cv: int, middle: Tensor, half: Tensor) -> None:
+    def _build_ends(self, model: Identified, loads: Loads, n_cv: int, middle: Tensor, half: Tensor) -> None:
         """Everything that is affine in the inputs, and the layout of the state."""
         n_a, n_y = self.observer.n_a, model.n_y
         y_center, y_scale, count = model.y_center, model.y_scale, self.moves.count
@@ -137,11 +139,8 @@ class Predictive(ControlLaw):
             v = (torch.cat([p["mv"], p["dv"]], dim=-1) - model.v_center) / model.v_scale
             z = (p["mv"] - middle) / half
             one = torch.ones_like(z[..., :1])
-            rest = torch.cat([y, v, one], dim=-1) @ model.rest[n_y:].T
             past = [
-                y,
-                rest,
-                one * torch.zeros(self.n_d, dtype=torch.float64),
+                torch.cat([y, v, one], dim=-1) @ rest.T,
                 one * first,
                 0 * y,
                 0 * y,
@@ -151,6 +150,8 @@ class Predictive(ControlLaw):
             sp = (p["sp"] - y_center[:n_cv]) / y_scale[:n_cv]
             return {"y": y, "sp": sp, "z": z, "v": v, "past": torch.cat(past, dim=-1), "one": one}
 
+        rest = held_rest(model, loads)
+        rest[:n_y] = torch.eye(*rest[:n_y].shape, dtype=torch.float64)  # rounding moves no output
         signals = self.signals
         self.layout = {n: len(getattr(signals, n)) for n in ("sp", "pv", "dv", "mv")}
         self.inputs = AffineMap(self.layout, inputs)
@@ -245,6 +246,9 @@ class Predictive(ControlLaw):
         seen, boost = self.observer(now["y"], acted, Estimate(kept["mean"], square, kept["drift"], kept["squares"]))
         flat = seen.covariance.flatten(-2).index_select(-1, self.upper).unsqueeze(-2)
         known = torch.cat([seen.mean, flat, seen.drift, seen.squares, kept["plan"] @ self.shift], dim=-1)
-        past = torch.where(kept["started"] > 0, known, now["past"])
+        n_x, first = self.observer.n_x, now["past"]
+        loads = torch.minimum(torch.maximum(first[..., n_x:n_a], -self.largest), self.largest)
+        first = torch.cat([first[..., :n_x], loads, first[..., n_a:]], dim=-1)
+        past = torch.where(kept["started"] > 0, known, first)
         n_plan = self.moves.count
         return past[..., :n_a], kept["started"] * boost, past[..., :-n_plan], past[..., -n_plan:]

@@ -1,0 +1,86 @@
+"""A predictive law without a past takes the plant for at rest, under loads that hold it there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from identified_models import random_model, scaled_model
+from predictive_loops import NONE, law_of
+from torch import Tensor
+
+from pipeline.laws.predictive.loads import Where, held_rest, loads_of
+from pipeline.laws.predictive.predictive import Predictive
+from pipeline.models.identified.identified import Identified
+
+PLACES: tuple[Where, ...] = ("mvs", "outputs")
+
+
+def drawn(seed: int, *sizes: int) -> list[Tensor]:
+    rng = np.random.default_rng(seed)
+    return [torch.from_numpy(rng.uniform(-0.3, 0.3, n)) for n in sizes]
+
+
+def first_move(law: Predictive, y: Tensor, mv: Tensor, sp: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """What the cold law asks for beyond the applied MV, and its info."""
+    with torch.no_grad():
+        asked, _, info = law(y if sp is None else sp, y, NONE, mv, torch.zeros(law.n_state, dtype=torch.float64))
+    return asked - mv, info
+
+
+def level() -> Identified:
+    """An integrator behind a lag, which rests under no MV of its range by itself."""
+    a, b = np.array([[1.0, 0.1], [0.0, 0.7]]), np.array([[0.0], [0.3]])
+    return scaled_model(1, 1, 0, 2, a=a, b=b, c=np.array([0.03, 0.0]), rest=np.eye(2, 3), rest_cov=0.01 * np.eye(2))
+
+
+@pytest.mark.parametrize("where", PLACES)
+@pytest.mark.parametrize("seed", range(5))
+def test_the_loads_hold_a_linear_model_at_any_rest(seed: int, where: Where) -> None:
+    model = random_model(seed, n_y=2, n_mv=2, n_hidden=0)
+    loads = loads_of(model, where, 30)
+    y, v = drawn(seed, 2, 2)
+    x, d = torch.split(held_rest(model, loads) @ torch.cat([y, v, torch.ones(1, dtype=torch.float64)]), [4, 2])
+    ahead = model(torch.cat([x, v + loads.into_v @ d])) + loads.into_x @ d
+    torch.testing.assert_close(ahead, x, atol=1e-4, rtol=0)
+    torch.testing.assert_close(x[:2], y, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("where", PLACES)
+@pytest.mark.parametrize("seed", range(5))
+def test_on_set_point_a_cold_law_keeps_the_mv(seed: int, where: Where) -> None:
+    """Of three plants in closed-loop records the MV moved by 9 to 22 % of its range at the first sample."""
+    model = random_model(seed, n_y=2, n_mv=2, n_hidden=0)
+    y, mv = drawn(100 + seed, 2, 2)
+    moved, _ = first_move(law_of(model, loads=where), y, mv)
+    assert moved.abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("mv", [-0.2, 0.0, 0.4])
+@pytest.mark.parametrize("where", PLACES)
+def test_a_level_is_kept_by_the_mv_that_keeps_it(where: Where, mv: float) -> None:
+    moved, _ = first_move(law_of(level(), loads=where), torch.tensor([0.2]).double(), torch.tensor([mv]).double())
+    assert moved.abs().max() < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_network_under_a_load_is_kept_nearly(seed: int) -> None:
+    model = random_model(seed, n_hidden=5)
+    model.c.copy_(-torch.tanh(model.b1) @ model.w2.T)  # as the mean of a record, zero is a rest
+    load, mv = drawn(200 + seed, 1, 1)
+    x = torch.zeros(model.n_x, dtype=torch.float64)
+    for _ in range(300):
+        x = model(torch.cat([x, mv + load]))
+    moved, _ = first_move(law_of(model), model.measured(x), mv)
+    assert moved.abs().max() < 0.1 * load.abs().max() + 0.01
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_what_no_load_of_a_rest_explains_is_no_rest(where: Where) -> None:
+    """A plant that is started far from where its MV would bring it: the load stays within what rests have."""
+    model = random_model(1, n_hidden=0)
+    law = law_of(model, loads=where)
+    _, info = first_move(law, torch.tensor([50.0]).double(), torch.zeros(1, dtype=torch.float64))
+    assert info[0].abs() == pytest.approx(float(law.largest * law.load_scale))
+    if where == "mvs":  # as much as the MV's whole range
+        assert info[0].abs() == pytest.approx(float(law.high - law.low), rel=1e-6)
