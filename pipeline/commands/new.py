@@ -210,7 +210,7 @@ def _write(
             plant |= {"simulator": simulator.as_posix()}
         entries = entries_of(name, plant, export, report.old_controllers)
         try:
-            lost = wishes_lost(name, entries)
+            lost = wishes_lost(name, entries, earlier / "screening.json")
             add_entries(entries, replace=options.replace, remove=[("exports", name)] if options.replace else ())
         except PipelineError:
             shutil.rmtree(folder)
@@ -220,7 +220,7 @@ def _write(
     shutil.rmtree(earlier, ignore_errors=True)
     if not unusable:
         shutil.rmtree(WORK / name, ignore_errors=True)  # models of a plant that was replaced need not suit this one
-    tell(name, folder, report, test, not unusable)
+    tell(name, folder, report, test, added=not unusable, asked=bool(questions))
     if not (made or report.operated):
         print("the old controller is not known, as no set point is named: with --sp TAG, and --mode TAG, it stands in "
               "every table")  # fmt: skip

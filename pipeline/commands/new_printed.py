@@ -12,8 +12,8 @@ from pipeline.pictures.drawing import axis_label, ratio_unit
 from serving.words import plain
 
 
-def tell(name: str, folder: Path, report: Screening, test: StepTest | None, added: bool) -> None:
-    """Print the rows kept, what was found, the verdict, and where to look next."""
+def tell(name: str, folder: Path, report: Screening, test: StepTest | None, *, added: bool, asked: bool) -> None:
+    """Print the rows kept, what was found, the verdict, and where to look next; ``asked``: a question comes first."""
     print(f"{name}: {report.summary}")
     if report.gaps:
         length = f"{report.gap_s / 60:.4g} min together"
@@ -37,7 +37,8 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, adde
             more = f"record more, as the {test.hours:.1f} h of the step test below," if test else "record more"
             print(f"{name} was added in spite of this, and its models may be poor: look at their fit in the report, "
                   f"or {more} and give all files again with --replace")  # fmt: skip
-        print(f"then: loopwright run {name}")
+        if not asked:
+            print(f"then: loopwright run {name}")
     if test:
         moved = zip(test.names, test.units, test.sizes, strict=True)
         sizes = ", ".join(f"{mv} by up to {axis_label(f'{size:.3g}', unit)} to each side" for mv, unit, size in moved)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.cases import CASES
+from pipeline.cases.own_entries import entries_of
 from pipeline.commands.new_known import Stated, checked
 from pipeline.commands.new_simulated import SIMULATOR
 from pipeline.config.known import Known, together
@@ -15,6 +17,7 @@ from pipeline.config.params import read_section, sections
 from pipeline.config.plants import PlantParams
 from pipeline.errors import RecordError
 from pipeline.historian.tags import COMMANDS, Tag
+from pipeline.records.old_controller import OldController
 
 REFUSED = {"screening.json", "screening.html", "step_test.csv"}  # all that is left of an export that was not added
 OWN = {*REFUSED, "record.parquet", "first_test.json"}  # what is written for a plant, beside its simulator
@@ -60,17 +63,23 @@ def known_kept(plant: str, said: Stated, tags: Sequence[Tag]) -> tuple[tuple[Kno
     return checked((*kept, *said.known), tags), [f"known: {k.pair}={k.says}" for k in kept]
 
 
-def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]], screening: Path) -> list[str]:
     """Settings that a person may have written and the new ``entries`` lack, as ``SECTION.NAME: key: value``.
 
-    Of a plant's controllers, where they may have other values too, and of how its export files are read.
+    Of a plant's controllers, where they may have other values too, and of how its export files are read. The numbers
+    of the old loop that `new` wrote itself, from the ``screening`` of the record before, are nobody's wish.
     """
     if plant not in sections("plants"):
         return []
     found = []
+    earlier = json.loads(screening.read_text(encoding="utf-8")) if screening.exists() else {}
+    old_loops = [OldController(**law) for law in earlier.get("old_controllers", ())]
+    written = entries_of(plant, {"data": "", **read_section("plants", plant)}, old=old_loops)["controllers"]
     for section in ("controllers", "exports"):
         for name, new in entries.get(section, {}).items():
             old = read_section(section, name) if name in sections(section) else {}
+            own = written.get(name, {}) if section == "controllers" else {}
             lost = [key for key in old if key not in new or (section == "controllers" and old[key] != new[key])]
+            lost = [key for key in lost if key not in own or own[key] != old[key]]
             found += [f"{section}.{name}: {key}: {old[key]}" for key in lost]
     return found

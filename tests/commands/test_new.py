@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from dirty_plant import TAGS, Clean, cells, clean, write
+from closed_loop_records import OperatedLoop
+from dirty_plant import START_S, TAGS, Clean, cells, clean, write
 from undrawn import draw_nothing
 
 from pipeline.__main__ import main
@@ -334,6 +335,26 @@ def test_all_tags_that_are_not_there_are_named_at_once(capsys: pytest.CaptureFix
     said = capsys.readouterr().err
     assert "no tag 'TIC-102.PV'; did you mean 'TIC-101.PV'?" in said
     assert "no tag 'TIC-102.OP'" in said
+
+
+@pytest.mark.parametrize("edited", [False, True])
+def test_the_old_loop_of_the_record_before_is_nobody_s_wish(edited: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    roles = ["--pv", "TIC.PV[degC]=0..100", "--mv", "TIC.OP[%]=0..100", "--sp", "TIC.SP"]
+    for file, kc in (("x.csv", 0.5), ("y.csv", 0.8)):
+        y, u, sp = OperatedLoop(2.0, dead=3, kc=kc, ti=10.0, hold=120).rows(2_400, 0)
+        rows = [[f"{START_S + k:.0f}", *(f"{v:.4f}" for v in row)] for k, row in enumerate(zip(y, u, sp, strict=True))]
+        write(Path(file), rows, ("timestamp", "TIC.PV", "TIC.OP", "TIC.SP"))
+    assert main(["new", "tank", "x.csv", *roles]) == 0
+    text = Path("params.yaml").read_text()
+    found = yaml.safe_load(text)["controllers"]["tank-old_loop"]
+    if edited:
+        assert text.count(f"kc: {found['kc']}") == 1
+        Path("params.yaml").write_text(text.replace(f"kc: {found['kc']}", "kc: 0.25"))
+    capsys.readouterr()
+    assert main(["new", "tank", "y.csv", *roles, "--replace"]) == 0
+    out = capsys.readouterr().out
+    assert ("again if you want it: controllers.tank-old_loop: kc: 0.25" in out) is edited
+    assert out.count("again if you want it") == edited
 
 
 def test_a_plant_is_replaced_on_request_and_kept_where_the_new_data_fail(capsys: pytest.CaptureFixture[str]) -> None:
