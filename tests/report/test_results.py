@@ -1,0 +1,26 @@
+"""The table that a run ends with, and what is said below it."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from pipeline.evaluation.standing import Standing
+from pipeline.report.results import AHEAD, show_results
+
+ARTIFACTS = Path(__file__).parents[2] / "artifacts"
+
+
+def test_a_ratio_below_the_bound_has_a_remark_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fresh user saw .64 of what no controller is expected to beat, without a word."""
+    said = {}
+    for ahead in (AHEAD, 0.0):
+        monkeypatch.setattr("pipeline.report.results.AHEAD", ahead)
+        show_results(ARTIFACTS, Console(file=(terminal := io.StringIO()), width=200))
+        said[ahead] = "below 1" in terminal.getvalue()
+    standings = [Standing.read(path.parent) for path in ARTIFACTS.glob("*/validation.json")]
+    ratios = [law.ratio for of in standings for law in of.laws if of.times == "× NMPC"]
+    assert said == {AHEAD: min(r for r in ratios if r is not None) < AHEAD, 0.0: False}
