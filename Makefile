@@ -11,8 +11,8 @@ export DO_NOT_TRACK := 1
 # Python keeps what it has compiled: else each process of the tests compiles all sources again, 10 s for some.
 unexport PYTHONDONTWRITEBYTECODE
 PORT ?= 5000
-# More than there are cores: tests of loops, servers and browsers mostly wait, see tests/scheduling.py. Each takes 1.2 GB.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 3)')
+# One a core computes, two keep time: tests of loops and servers mostly wait, see tests/scheduling.py. Each takes 1.2 GB.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 2)')
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run test check quick docs coverage registry bench release clean
