@@ -57,7 +57,7 @@ bench: $(STAMP) ## run the benchmarks, about 15 minutes
 	@echo "benchmarks: about 15 minutes; each says beforehand what it measures and how long it takes"
 	@for script in $(filter-out benchmarks/identification.py,$(wildcard benchmarks/[a-z]*.py)); do echo "== $$script"; python $$script || exit 1; done
 
-release: $(STAMP) ## build wheel, source archive, bill of materials and licences into dist/, and test them
+release: $(STAMP) ## build wheel, source archive, bill of materials and licences into dist/, run tests/release: 11 minutes
 	@PYTHON=python bash tools/release.sh
 	python -m pytest tests/release
 
