@@ -11,8 +11,8 @@ export DO_NOT_TRACK := 1
 # Python keeps what it has compiled: else each process of the tests compiles all sources again, 10 s for some.
 unexport PYTHONDONTWRITEBYTECODE
 PORT ?= 5000
-# More than there are cores: tests of loops, servers and browsers mostly wait, see tests/scheduling.py. Each takes 1.2 GB.
-WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 3)')
+# One a core computes, two keep time: tests of loops and servers mostly wait, see tests/scheduling.py. Each takes 1.2 GB.
+WORKERS ?= $(shell $(PYTHON) -c 'import os; print((os.cpu_count() or 1) + 2)')
 
 .DEFAULT_GOAL := help
 .PHONY: help setup run test check quick docs coverage registry bench release clean
@@ -57,7 +57,7 @@ bench: $(STAMP) ## run the benchmarks, about 15 minutes
 	@echo "benchmarks: about 15 minutes; each says beforehand what it measures and how long it takes"
 	@for script in $(filter-out benchmarks/identification.py,$(wildcard benchmarks/[a-z]*.py)); do echo "== $$script"; python $$script || exit 1; done
 
-release: $(STAMP) ## build wheel, source archive, bill of materials and licences into dist/, and test them
+release: $(STAMP) ## build wheel, source archive, bill of materials and licences into dist/, run tests/release: 11 minutes
 	@PYTHON=python bash tools/release.sh
 	python -m pytest tests/release
 

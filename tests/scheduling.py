@@ -2,8 +2,8 @@
 
 Files in KEEP_TIME run plants on a clock, browsers or servers that are asked in time: they mostly wait, and fail where
 they are not served when they need it. The others compute. So there are two kinds of workers. Some compute, at a low
-priority: one more than there are cores, since now and then one of them waits for processes. The others, two where there
-are enough, keep time at the usual priority, and compute when no such file is left.
+priority: as many as there are cores, since each more of them loads all libraries, which costs more than it gains. The
+others, two where there are enough, keep time at the usual priority, and compute when no such file is left.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Independent pieces in order, with their errors; here without a cluster, see test_cluster.py for one."""
+"""Independent pieces in order, with their errors; here without a cluster, see tests/release/test_cluster.py for one."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ def scheduler(files: list[str], nodes: list[Any]) -> TwoKinds:
     return made
 
 
-@pytest.mark.parametrize(("workers", "computing"), [(1, 0), (2, 1), (3, 1), (5, 3), (10, 8)])
+@pytest.mark.parametrize(("workers", "computing"), [(1, 0), (2, 1), (3, 1), (4, 2), (5, 3), (10, 8)])
 def test_two_keep_time_where_there_are_enough(workers: int, computing: int) -> None:
     assert [computes(node(i, workers)) for i in range(workers)] == [i < computing for i in range(workers)]
     assert computes(node(workers, workers)) == (computing > 0)  # which takes the place of the first, after a crash

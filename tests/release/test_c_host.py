@@ -155,7 +155,7 @@ def test_the_folder_of_onnxruntime_counts_from_where_the_user_stands(tmp_path: P
 
 
 def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:
-    """Write failures, operators' mistakes and gaps, which no vector holds: tests/hosts/loop_faults.c."""
+    """Write failures, operators' mistakes and gaps, which no vector holds: tests/release/loop_faults.c."""
     (tmp_path / "host.c").write_text(Path(__file__).with_name("loop_faults.c").read_text())
     shutil.copy(EMBED / "c" / "host.c", tmp_path / "embedded.h")
     done = run(changed_host(tmp_path / "host.c"), kit_of(PID) / "pid.onnx")
