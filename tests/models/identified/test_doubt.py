@@ -31,6 +31,16 @@ def test_the_output_counts_that_an_mv_moves_most() -> None:
     assert found.gain == pytest.approx([0.0345], rel=0.01)
 
 
+def test_an_answer_that_goes_on_counts_as_far_as_a_law_looks() -> None:
+    """Growth in 4,000 rows: poles about 1 made 696 % of 15 %, and a law that held was withheld on a plant gone so."""
+    k = np.arange(1, 901)
+    members = [answer(g, 0.9, 0, 900) * r**k + 0.002 * k for g, r in ((0.9, 1.002), (1.0, 1.0), (1.1, 0.998))]
+    found = doubt_of(np.array(members)[:, None, :, None], 1)
+    assert found.gain[0] < 0.1
+    assert found.pace[0] < 0.2
+    assert found.dead[0] < 1.0
+
+
 def test_a_single_model_and_an_mv_without_effect_leave_nothing_open() -> None:
     assert doubt_of(answer(1.0, 0.9, 0)[None, None, :, None], 1).gain == [0.0]
     still = doubt_of(np.zeros((3, 1, 50, 1)), 1)
