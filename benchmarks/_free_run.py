@@ -50,10 +50,8 @@ class Predictor:
     """A model that runs free over test rows: its equation, its scales, and whether the MV of a row acts on that row."""
 
     dynamics: Dynamics
-    y_center: float
-    y_scale: float
-    u_center: float
-    u_scale: float
+    y_units: tuple[float, float]  # of a scaled output: its center, and its scale
+    u_units: tuple[float, float]
     same_row: bool
     words: str
 
@@ -81,12 +79,14 @@ class Predictor:
 
             start = center + root @ least_squares(misses, np.zeros(len(center))).x
         ahead = self.dynamics.free_run(start, rows)
-        return np.full(len(part.y), np.nan) if ahead is None else ahead[0][:, 0] * self.y_scale + self.y_center
+        y: Array = np.full(len(part.y), np.nan) if ahead is None else ahead[0][:, 0]
+        return y * self.y_units[1] + self.y_units[0]
 
     def _rows(self, part: Part) -> Stretch:
         """Scaled rows, each MV where it acts."""
         u = np.append(part.u[1:], part.u[-1]) if self.same_row else part.u
-        y, v = (part.y - self.y_center) / self.y_scale, (u - self.u_center) / self.u_scale
+        (y0, y1), (u0, u1) = self.y_units, self.u_units
+        y, v = (part.y - y0) / y1, (u - u0) / u1
         return Stretch(y[:, None], v[:, None])
 
 
@@ -115,5 +115,5 @@ def linear_model(learn: Part, period_s: float, rows: int = 8000, orders: Sequenc
             fitted = OutputError(iterations=25).fit(starts.order(order), train, held)
             found.append((fitted.held_out, order, same_row, fitted.model))
     _, order, same_row, best = min(found, key=lambda one: one[0])
-    numbers = (float(of[0]) for of in (scales.y_center, scales.y_scale, scales.v_center, scales.v_scale))
-    return Predictor(best, *numbers, same_row, f"linear, {order} states")
+    y, u = (float(scales.y_center[0]), float(scales.y_scale[0])), (float(scales.v_center[0]), float(scales.v_scale[0]))
+    return Predictor(best, y, u, same_row, f"linear, {order} states")

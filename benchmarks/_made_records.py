@@ -116,7 +116,7 @@ def drive(seed: int = 0, rows: int = 500) -> Task:
     period_s, w, damping = 0.02, 2 * np.pi * 1.5, 0.12
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.uniform(-0.8, 1.2, -(-rows // 10)), 10)[:rows]
-    denominator = np.polymul([0.25, 1.0], [1.0, 2 * damping * w, w * w])
+    denominator: Array = np.asarray(np.polymul([0.25, 1.0], [1.0, 2 * damping * w, w * w]), dtype=np.float64)
     a, b, _, _ = (np.atleast_2d(m) for m in _companion(denominator, w * w, period_s))
     x, speed = np.zeros(3), np.empty(rows)
     for k in range(rows):

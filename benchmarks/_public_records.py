@@ -12,7 +12,7 @@ is) or as .mat with variables of the same names:
                learn, and those to 184,000 to test; 51.2 kHz     [V]
     bouc_wen   uval_multisine, yval_multisine, uval_sinesweep, yval_sinesweep: rows to test alone; 750 Hz   [N], [m]
 
-These are the splits of the package nonlinear_benchmarks 0.1.1 (G. Beintema). The initial state of a test is fitted to
+These are the splits of the package nonlinear_benchmarks (G. Beintema). The initial state of a test is fitted to
 its first rows, which do not count. EMPS rows are thinned to 10 ms.
 """
 

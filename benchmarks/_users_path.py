@@ -113,6 +113,6 @@ def predictor_of(model: Identified, structure: Mapping[str, Any]) -> Predictor:
     """A fitted model of one input and one output, to be run over test rows."""
     of = {name: np.array(value.numpy()) for name, value in model.state_dict().items()}
     dynamics = Dynamics(*(of[name] for name in ("a", "b", "c", "w1", "b1", "w2")))
-    scales = (float(of[name][0]) for name in ("y_center", "y_scale", "v_center", "v_scale"))
+    y, u = ((float(of[f"{signal}_center"][0]), float(of[f"{signal}_scale"][0])) for signal in ("y", "v"))
     words = f"{structure['start']}, {structure['order']} states, {structure['hidden']} units, by {structure['judged']}"
-    return Predictor(dynamics, *scales, structure["same_row"], words)
+    return Predictor(dynamics, y, u, structure["same_row"], words)

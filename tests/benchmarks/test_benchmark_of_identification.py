@@ -119,7 +119,7 @@ def test_friction_holds_the_sledge_where_the_force_is_small(parts: Any) -> None:
 # ---------------------------------------------------------------------- the rule
 def predictor(parts: Any) -> Any:
     return parts.identification.Predictor(
-        Dynamics.linear(np.array([[0.8]]), np.array([[0.4]])), 0.0, 1.0, 0.0, 1.0, False, "the plant"
+        Dynamics.linear(np.array([[0.8]]), np.array([[0.4]])), (0.0, 1.0), (0.0, 1.0), False, "the plant"
     )
 
 
@@ -143,7 +143,9 @@ def test_rows_that_fit_the_initial_state_do_not_count(parts: Any) -> None:
 def test_the_initial_state_is_the_most_likely_one_of_the_first_rows(parts: Any) -> None:
     """x = m + C O' (O C O' + s^2 I)^-1 (y - O m) for two rows of a model without input, m and C from learning."""
     free, a = parts._free_run, np.array([[0.5, 0.5], [-0.5, 0.8]])
-    model = parts.identification.Predictor(Dynamics.linear(a, np.zeros((2, 1))), 0.0, 1.0, 0.0, 1.0, False, "the plant")
+    model = parts.identification.Predictor(
+        Dynamics.linear(a, np.zeros((2, 1))), (0.0, 1.0), (0.0, 1.0), False, "the plant"
+    )
     states = [np.array([1.0, 2.0])]
     for _ in range(30):
         states.append(a @ states[-1])
