@@ -75,12 +75,13 @@ class Predictor:
 
             def misses(z: Array) -> Array:
                 ahead = self.dynamics.free_run(center + root @ z, first)
-                return np.r_[np.full(begin, 1e3) if ahead is None else (ahead[0][:, 0] - first.y[:, 0]) / noise, z]
+                missed = np.full(begin, 1e3) if ahead is None else (ahead[0][:, 0] - first.y[:, 0]) / noise
+                return np.concatenate([missed, z])
 
             start = center + root @ least_squares(misses, np.zeros(len(center))).x
         ahead = self.dynamics.free_run(start, rows)
-        y: Array = np.full(len(part.y), np.nan) if ahead is None else ahead[0][:, 0]
-        return y * self.y_units[1] + self.y_units[0]
+        y = np.full(len(part.y), np.nan) if ahead is None else ahead[0][:, 0]
+        return np.asarray(y * self.y_units[1] + self.y_units[0])
 
     def _rows(self, part: Part) -> Stretch:
         """Scaled rows, each MV where it acts."""
