@@ -1,25 +1,17 @@
-"""Identification on public records: free-run error over their test rows beside published figures.
+"""Identification on public records and on made ones, by the path of a user: free-run errors over test rows.
 
-``python benchmarks/identification.py DIR [RECORD ...]``; a row a record whose files are in DIR, all with the defaults
-of the part ``identified`` (member 0, and the pointwise median of the three members), for each of ``--seeds`` seeds of
-the search. ``--screened`` passes the rows to learn through `loopwright new` first, as the export of a plant. This is
-the way of a user, and `loopwright run` then has seed 0. The records are not part of this repository;
-nonlinearbenchmark.org and its mirrors hold them. DIR holds, flat or in folders of any name, as .csv (a head of column
-names, each column as long as it is) or as .mat with variables of the same names:
+``python benchmarks/identification.py [--data FOLDER] [--only NAME ...] [--seeds 0 1 2]``; some minutes a record and
+seed. An export of the rows to learn goes through `loopwright new`, and through the stages `screen` and `fit` of
+`loopwright run`, all with their defaults. The product never sees the test rows. The model that controllers would be
+designed on runs free over these; the rows that its initial state is fitted to do not count.
 
-    tanks      dataBenchmark    uEst, yEst: 1,024 rows to learn; uVal, yVal: 1,024 rows to test; 4 s      [V]
-    drives_low, drives_high   DATAUNIF    u11, z11 and u12, z12: 500 rows each, the first 400 to learn; 20 ms
-    emps       DATA_EMPS, DATA_EMPS_PULSES   vir [N], qm [m]: 1 ms; the first file to learn, the second to test
-    wiener_hammerstein   WienerHammerBenchMark   uBenchMark, yBenchMark: 188,000 rows, of which 5,200 to 105,200 to
-               learn, and those to 184,000 to test; 51.2 kHz     [V]
-    silverbox  SNLS80mV         V1, V2: 131,072 rows, of which 40,650 to 105,712 to learn (the multisine), those to
-               127,400 to test, and 100 to 40,575 (the arrow, whose end leaves the range that was learnt); 610 Hz  [V]
+The public records are not part of this repository; nonlinearbenchmark.org and its mirrors hold them. --data names the
+folder of their files, which ``_public_records.py`` lists. The made records are like these
+(``_made_records.py``): their truth is known, so that the error of the true model, which is the noise, stands beside. A
+linear output-error model of all rows to learn is the linear baseline.
 
-These are the splits of the package nonlinear_benchmarks. The initial state of a test is fitted to its first rows
-(5, 4, 20, 50 and 50), which do not count. The EMPS integrate: rows are thinned to 10 ms, the velocity (differences of
-qm) is identified, and its free run summed up again. A record longer than ``--rows`` gives its most informative blocks.
-
-Published figures: the best black-box model and the best linear one that the benchmark's pages or a survey list (RMSE).
+Where `new` refuses a record, the table says so, and the model is that of `--anyway`. Where a plant is known to overflow
+a second row has the table of tags say `keep`, as `new` asks for. Published figures are RMSE over the same rows.
 """
 
 from __future__ import annotations
@@ -28,214 +20,154 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-from scipy.io import loadmat
+import torch
+from _free_run import Predictor, Task, error_of, linear_model
+from _made_records import MADE
+from _public_records import PUBLIC, Published, public_task
+from _users_path import Project
 
-from pipeline.config.exports import ExportedTag, ExportParams
-from pipeline.historian.exported import screened_export, signal_tags
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.identified.output_error import fit_starts
-from pipeline.models.part import Source
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from pipeline.errors import PipelineError
 
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Neighbouring rows of input u (n,) and output y (n,)."""
-
-    u: Array
-    y: Array
+HEAD = (
+    "record",
+    "unit",
+    "noise",
+    "linear",
+    "model",
+    "minutes",
+    "`new` says",
+    "published: linear",
+    "black box",
+    "grey box",
+)
 
 
-@dataclass(frozen=True, eq=False)
-class Task:
-    """Rows to learn, tests by name, rows that fit a test's initial state, and how a free run becomes the output."""
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A record to be identified, and how its figures are written."""
 
-    learn: Part
-    tests: Mapping[str, Part]
-    begin: int
-    period_s: float
-    scale: float = 1.0  # of the figures
-    summed: bool = False  # the output is the sum of what the model predicts
-
-
-@dataclass(frozen=True)
-class Public:
-    """A public record: its files, how they become a task, unit of the figures, and what is published."""
-
-    files: tuple[str, ...]
-    task: Callable[[list[dict[str, Array]]], Task]
+    name: str
+    task: Task
     unit: str
-    published: str
+    published: Mapping[str, Published]
+    keep: bool = False  # the table of tags says that y ends where the plant does
 
 
-def columns(path: Path) -> dict[str, Array]:
-    """Name -> values (n,) of a .mat or .csv file, without the empty cells behind a short column."""
-    if path.suffix.lower() == ".mat":
-        return {k: np.ravel(v).astype(np.float64) for k, v in loadmat(path).items() if not k.startswith("__")}
-    with path.open(encoding="utf-8-sig") as file:
-        names = [name.strip().strip('"') for name in file.readline().rstrip("\n").split(",")]
-        table = np.genfromtxt(file, delimiter=",", usecols=range(len(names)), invalid_raise=False)
-    return {name: column[~np.isnan(column)] for name, column in zip(names, table.T, strict=True) if name}
+@dataclass(slots=True)
+class Found:
+    """Of one record: what `new` says, errors by test and seed (none without a model), and the minutes of each seed."""
+
+    says: str
+    errors: dict[str, list[float | None]] = field(default_factory=dict)
+    minutes: list[float] = field(default_factory=list)
 
 
-def found(folder: Path, name: str) -> Path | None:
-    """The file of this name, .csv or .mat in any spelling, anywhere under the folder; the first by its path."""
-    wanted = {f"{name}{end}".lower() for end in (".csv", ".mat")}
-    return next((p for p in sorted(folder.rglob("*")) if p.name.lower() in wanted), None)
-
-
-# ---------------------------------------------------------------------- the records
-def tanks(files: list[dict[str, Array]]) -> Task:
-    (f,) = files
-    return Task(Part(f["uEst"], f["yEst"]), {"test": Part(f["uVal"], f["yVal"])}, 5, 4.0)
-
-
-def drives(u: str, z: str) -> Callable[[list[dict[str, Array]]], Task]:
-    def task(files: list[dict[str, Array]]) -> Task:
-        (f,) = files
-        return Task(Part(f[u][:400], f[z][:400]), {"test": Part(f[u][400:], f[z][400:])}, 4, 0.02)
-
-    return task
-
-
-def emps(files: list[dict[str, Array]]) -> Task:
-    learn, test = (Part(f["vir"][::10], f["qm"][::10]) for f in files)
-    return Task(learn, {"test": test}, 20, 0.01, scale=1000.0, summed=True)
-
-
-def wiener_hammerstein(files: list[dict[str, Array]]) -> Task:
-    (f,) = files
-    u, y = f["uBenchMark"][5_200:184_000], f["yBenchMark"][5_200:184_000]
-    return Task(Part(u[:100_000], y[:100_000]), {"test": Part(u[100_000:], y[100_000:])}, 50, 1 / 51_200, scale=1000.0)
-
-
-def silverbox(files: list[dict[str, Array]]) -> Task:
-    (f,) = files
-    cut = {"learn": (40_650, 105_712), "multisine": (105_712, 127_400), "arrow": (100, 40_575)}
-    parts = {name: Part(f["V1"][i:j], f["V2"][i:j]) for name, (i, j) in cut.items()}
-    learn = parts.pop("learn")
-    return Task(learn, parts, 50, 1 / 610.35, scale=1000.0)
-
-
-RECORDS = {
-    "tanks": Public(("dataBenchmark",), tanks, "V", "black box .306, linear .588"),
-    "drives_low": Public(("DATAUNIF",), drives("u11", "z11"), "ticks/s", "a trial .067, its best peer .096"),
-    "drives_high": Public(("DATAUNIF",), drives("u12", "z12"), "ticks/s", "a trial .038, its best peer .074"),
-    "emps": Public(("DATA_EMPS", "DATA_EMPS_PULSES"), emps, "mm", "black box 2.64"),
-    "wiener_hammerstein": Public(("WienerHammerBenchMark",), wiener_hammerstein, "mV", "SUBNET .24, recurrent 4"),
-    "silverbox": Public(("SNLS80mV",), silverbox, "mV", "black box .3 to .6"),
-}
-
-
-# ---------------------------------------------------------------------- one record
-def record_of(part: Part, period_s: float) -> Record:
-    """The rows as a record of one PV and one MV, with ranges that hold what was learnt."""
-    low, high = float(part.u.min()), float(part.u.max())
-    half = float(np.ptp(part.y))
-    pv = Signal("y", "-", float(part.y.min()) - half, float(part.y.max()) + half)
-    signals = Signals(period_s, (pv,), (pv,), (), (Signal("u", "-", low, high),))
-    return Record.of(signals, part.y[:, None], part.u[:, None])
-
-
-def screened_rows(part: Part, period_s: float) -> Record:
-    """The rows as `loopwright new` keeps them of an export with the columns time_s, y (a PV) and u (an MV)."""
-    tags = (ExportedTag("y", "pv"), ExportedTag("u", "mv"))
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "export.csv"
-        rows = np.column_stack([period_s * np.arange(len(part.y)), part.y, part.u])
-        np.savetxt(path, rows, delimiter=",", header="time_s,y,u", comments="", fmt="%.10g")
-        return screened_export(ExportParams("record", (path,), tags), signal_tags(tags)).record
-
-
-def velocity(part: Part) -> Part:
-    """The differences of the output a row; the last input has none."""
-    return Part(part.u[:-1], np.diff(part.y))
-
-
-def free_run(model: Identified, part: Part, begin: int, same_row: bool) -> Array:
-    """The model's output (n,) over all rows, its initial state fitted to the first ``begin``; NaN where it explodes."""
-    of = {name: np.array(value.numpy()) for name, value in model.state_dict().items()}
-    dynamics = Dynamics(*(of[name] for name in ("a", "b", "c", "w1", "b1", "w2")))
-    u = np.append(part.u[1:], part.u[-1]) if same_row else part.u
-    y, v = (part.y - of["y_center"]) / of["y_scale"], (u - of["v_center"]) / of["v_scale"]
-    data = Stretch(y[:, None], v[:, None])
-    start = fit_starts(dynamics, [Stretch(data.y[:begin], data.v[:begin])])[0]
-    run = dynamics.free_run(start, data)
-    if run is None:
-        return np.full(len(y), np.nan)
-    return np.asarray(run[0][:, 0] * of["y_scale"] + of["y_center"])
-
-
-def row_of(
-    name: str, task: Task, unit: str, published: str, part: IdentifiedPart, seed: int = 0, screened: bool = False
-) -> str:
-    """The row of one record and one seed of the search; ``screened``: learnt from what `loopwright new` keeps."""
-    began = time.perf_counter()
-    learn = velocity(task.learn) if task.summed else task.learn
-    record = screened_rows(learn, task.period_s) if screened else record_of(learn, task.period_s)
-    source = Source(record, record_signals(record), seed=seed)
-    work = part.groundwork()
-    source = replace(source, groundwork={work: work.done(source, name)})
-    learnt = [replace(part, member=k).learn(source) for k in range(3)]
-    minutes = (time.perf_counter() - began) / 60
-    structure = learnt[0].metrics["structure"]
-    cells = []
-    for test, rows in task.tests.items():
-        runs = []
-        for one in learnt:
-            assert isinstance(one.model, Identified)
-            run = free_run(one.model, velocity(rows) if task.summed else rows, task.begin, structure["same_row"])
-            runs.append(rows.y[0] + np.append(0.0, np.cumsum(run)) if task.summed else run)
-        errors = [
-            task.scale * float(np.sqrt(np.mean((r - rows.y)[task.begin :] ** 2)))
-            for r in (runs[0], np.median(runs, axis=0))
-        ]
-        cells.append(f"{test}: {errors[0]:.4g}, median of members {errors[1]:.4g} {unit}")
-    form = f"{structure['start']} {structure['order']} states, {structure['hidden']} units, {len(record)} rows"
-    return f"{name:20} seed {seed}  {'; '.join(cells):70} {minutes:5.1f} min  ({published}; {form})"
-
-
-def record_signals(record: Record) -> Signals:
-    """The signals of a record of ``record_of``."""
-    return Signals(record.period_s, record.pv_signals, record.pv_signals, (), record.mv_signals)
-
-
-def main(argv: list[str]) -> int:
-    """Print a row a record as it comes."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("folder", type=Path, metavar="DIR")
-    parser.add_argument("records", nargs="*", choices=[[], *RECORDS], help="(default: all whose files are there)")
-    parser.add_argument("--rows", type=int, default=8_000, help="that are fitted at most (8000)")
-    parser.add_argument("--minutes", type=float, help="of the search on one core (2)")
-    parser.add_argument("--seeds", type=int, default=1, help="of the search, a row each (1)")
-    parser.add_argument("--screened", action="store_true", help="learn from the rows that `loopwright new` keeps")
-    options = parser.parse_args(argv)
-    if not options.folder.is_dir():
-        parser.error(f"{options.folder} is no folder; give the one that holds the records")
-    part, rows = IdentifiedPart(rows=options.rows, minutes=options.minutes), 0
-    print("RMSE of the free run over test rows, beside what is published")
-    for name in options.records or RECORDS:
-        public = RECORDS[name]
-        paths = [found(options.folder, file) for file in public.files]
-        there = [path for path in paths if path is not None]
-        if len(there) < len(paths):
-            print(f"{name:20} {' and '.join(public.files)} .csv or .mat not found under {options.folder}", flush=True)
+def entries_of(data: Path | None, only: Sequence[str]) -> list[Entry]:
+    """The records that are at hand, public ones first; one that overflows comes twice."""
+    found = []
+    for name in only or [*PUBLIC, *MADE]:
+        if name in MADE:
+            make, unit, _ = MADE[name]
+            found.append(Entry(name, make(), unit, {}))
             continue
-        task = public.task([columns(p) for p in there])
-        for seed in range(options.seeds):
-            print(row_of(name, task, public.unit, public.published, part, seed, options.screened), flush=True)
-        rows += 1
-    return 0 if rows else 1
+        task = None if data is None else public_task(data, name)
+        if task is None:
+            where = "no --data" if data is None else f"not under {data}"
+            print(f"{name}: {', '.join(PUBLIC[name].files)} (.csv or .mat): {where}", flush=True)
+            continue
+        found.append(Entry(name, task, PUBLIC[name].unit, PUBLIC[name].published))
+    kept = [Entry(f"{e.name}_kept", e.task, e.unit, e.published, keep=True) for e in found if e.task.overflows]
+    return sorted([*found, *kept], key=lambda e: [f.name for f in found].index(e.name.removesuffix("_kept")))
+
+
+def found_of(entry: Entry, project: Project, seeds: Sequence[int]) -> Found:
+    """The product's models of one record; a line a seed as it comes."""
+    task, began = entry.task, time.perf_counter()
+    answer = project.new(entry.name, task.learn, task.period_s, keep=entry.keep)
+    found = Found(f"refused: {answer.refused}" if answer.refused else answer.verdict)
+    if answer.refused:
+        print(f"{entry.name}: `new` refuses: {answer.refused}", flush=True)
+        answer = project.new(entry.name, task.learn, task.period_s, keep=entry.keep, anyway=True)
+    asked = (time.perf_counter() - began) / 60
+    for seed in seeds if not answer.refused else ():
+        began = time.perf_counter()
+        model, why = project.model(entry.name, seed)
+        found.minutes.append(asked + (time.perf_counter() - began) / 60)
+        for test, error in errors_of(model, task).items():
+            found.errors.setdefault(test, []).append(error)
+        figures = ", ".join(f"{test} {_number(errors[-1])}" for test, errors in found.errors.items())
+        words = model.words if model else why
+        print(f"{entry.name}: seed {seed}: {figures} {entry.unit} ({words}; {found.minutes[-1]:.1f} min)", flush=True)
+    return found
+
+
+def errors_of(model: Predictor | None, task: Task) -> dict[str, float | None]:
+    """Error of a free run over each test, in the unit of the figures."""
+    return {
+        test: None if model is None else error_of(model.free_run(part, task.begin, task.learn), part, task)
+        for test, part in task.tests.items()
+    }
+
+
+def linear_errors(task: Task) -> dict[str, float | None]:
+    """The same of the linear baseline; none where no linear model can be fitted."""
+    try:
+        return errors_of(linear_model(task.learn, task.period_s), task)
+    except PipelineError as error:
+        print(f"  no linear baseline: {error}", flush=True)
+        return errors_of(None, task)
+
+
+def rows_of(entry: Entry, found: Found) -> list[str]:
+    """Rows of the closing table, one a test."""
+    linear = linear_errors(entry.task)
+    minutes = f"{sum(found.minutes) / len(found.minutes):.1f}" if found.minutes else "-"
+    rows = []
+    for test, part in entry.task.tests.items():
+        name = entry.name if test == "test" else f"{entry.name}, {test}"
+        noise = "-" if part.true is None else _number(error_of(part.true, part, entry.task))
+        models = " / ".join(map(_number, found.errors.get(test, []))) or "-"
+        others = entry.published.get(test, Published())
+        published = (others.linear or "-", others.black_box or "-", others.grey_box or "-")
+        cells = (name, entry.unit, noise, _number(linear[test]), models, minutes, found.says, *published)
+        rows.append(f"| {' | '.join(cells)} |")
+    return rows
+
+
+def _number(value: float | None) -> str:
+    return "no model" if value is None else "explodes" if value != value else f"{value:.3g}"
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print lines as they come, and the table; 1 where no record is at hand."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    add = parser.add_argument
+    add("--data", type=Path, metavar="FOLDER", help="of the public records' files (default: the made records alone)")
+    add(
+        "--only", nargs="+", choices=[*PUBLIC, *MADE], default=[], metavar="NAME", help=f"{', '.join([*PUBLIC, *MADE])}"
+    )
+    add("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the search for the model (0 1 2)")
+    add("--project", type=Path, metavar="FOLDER", help="a new folder that keeps what the product made (default: none)")
+    options = parser.parse_args(argv)
+    if options.data is not None and not options.data.is_dir():
+        parser.error(f"{options.data} is no folder; give the one that holds the records")
+    if options.project is not None and options.project.exists():
+        parser.error(f"{options.project} is there already; give a new folder")
+    torch.set_num_threads(1)
+    entries, rows = entries_of(options.data, options.only), list[str]()
+    if not entries:
+        return 1
+    with tempfile.TemporaryDirectory() as folder:
+        project = Project(options.project or Path(folder) / "project")
+        for entry in entries:
+            rows += rows_of(entry, found_of(entry, project, options.seeds))
+    heads = [f"seeds {' / '.join(map(str, options.seeds))}" if head == "model" else head for head in HEAD]
+    print("\n".join(["", f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}", *rows]))
+    return 0
 
 
 if __name__ == "__main__":

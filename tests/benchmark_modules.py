@@ -26,12 +26,16 @@ def benchmark_script(name: str) -> ModuleType:
 
 
 def own_plants_modules(names: Sequence[str]) -> SimpleNamespace:
-    """Modules of benchmarks/own_plants by name; their short names are free again afterwards."""
-    folder = str(FOLDER / "own_plants")
-    sys.path.insert(0, folder)
+    """Modules of benchmarks/own_plants by name."""
+    return benchmark_modules(names, FOLDER / "own_plants")
+
+
+def benchmark_modules(names: Sequence[str], folder: Path = FOLDER) -> SimpleNamespace:
+    """Modules of a folder of scripts by name; their short names are free again afterwards."""
+    sys.path.insert(0, str(folder))
     try:
         return SimpleNamespace(**{name: importlib.import_module(name) for name in names})
     finally:
-        sys.path.remove(folder)
+        sys.path.remove(str(folder))
         for name in names:
             sys.modules.pop(name, None)
