@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pipeline.historian.excitation import HELD
 from pipeline.historian.findings import InputReport, Screening, Verdict, counted
+from pipeline.historian.pace import in_words
 from pipeline.historian.step_test import StepTest
 from pipeline.pictures.drawing import axis_label, ratio_unit
 from serving.words import plain
@@ -15,6 +16,7 @@ from serving.words import plain
 def tell(name: str, folder: Path, report: Screening, test: StepTest | None, *, added: bool, asked: bool) -> None:
     """Print the rows kept, what was found, the verdict, and where to look next; ``asked``: a question comes first."""
     print(f"{name}: {report.summary}")
+    takes = in_words(3600 * test.hours) if test else ""
     if report.gaps:
         length = f"{report.gap_s / 60:.4g} min together"
         print(f"  {counted(report.gaps, 'gap')} without any reading, {length}; a run ends at each")
@@ -34,7 +36,7 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, *, a
     print(f"look at {folder}/screening.html: trends with every mask")
     if added:
         if report.verdict.carries != "yes":
-            more = f"record more, as the {test.hours:.1f} h of the step test below," if test else "record more"
+            more = f"record more, as the {takes} of the step test below," if test else "record more"
             print(f"{name} was added in spite of this, and its models may be poor: look at their fit in the report, "
                   f"or {more} and give all files again with --replace")  # fmt: skip
         if not asked:
@@ -42,7 +44,7 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, *, a
     if test:
         moved = zip(test.names, test.units, test.sizes, strict=True)
         sizes = ", ".join(f"{mv} by up to {axis_label(f'{size:.3g}', unit)} to each side" for mv, unit, size in moved)
-        print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {test.hours:.1f} h; "
+        print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {takes}; "
               f"it moves {sizes}{test.reading}")  # fmt: skip
 
 
