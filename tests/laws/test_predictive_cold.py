@@ -56,6 +56,18 @@ def test_on_set_point_a_cold_law_keeps_the_mv(seed: int, where: Where) -> None:
     assert moved.abs().max() < 1e-3
 
 
+def test_states_may_have_any_size() -> None:
+    """Only outputs and inputs are scaled: a blender of three loops had states beyond 8, and its MVs moved by 29 %."""
+    model = random_model(2, n_y=2, n_mv=2, n_hidden=0)
+    size = torch.tensor([1.0, 1.0, 300.0, 300.0]).double()
+    for name in ("b", "c"):
+        getattr(model, name).mul_(size if name == "c" else size[:, None])
+    model.a.mul_(size[:, None] / size)
+    y, mv = drawn(7, 2, 2)
+    moved, _ = first_move(law_of(model), y, mv)
+    assert moved.abs().max() < 1e-3
+
+
 @pytest.mark.parametrize("mv", [-0.2, 0.0, 0.4])
 @pytest.mark.parametrize("where", PLACES)
 def test_a_level_is_kept_by_the_mv_that_keeps_it(where: Where, mv: float) -> None:
@@ -73,6 +85,20 @@ def test_a_network_under_a_load_is_kept_nearly(seed: int) -> None:
         x = model(torch.cat([x, mv + load]))
     moved, _ = first_move(law_of(model), model.measured(x), mv)
     assert moved.abs().max() < 0.1 * load.abs().max() + 0.01
+
+
+@pytest.mark.parametrize("mv", [-0.8, -0.4, 0.0, 0.4, 0.8])
+def test_a_network_that_bends_much_and_has_no_load_is_kept(mv: float) -> None:
+    """As a neutralization, whose gain changes tenfold: loads by the slopes in the middle threw it off its set point."""
+    model = scaled_model(
+        1, 1, 0, 1, 1, a=np.array([[0.8]]), b=np.array([[0.02]]), c=np.zeros(1), w1=np.array([[0.0, 3.0]]),
+        b1=np.zeros(1), w2=np.array([[0.2]]), rest=np.array([[1.0, 0.0, 0.0]]), rest_cov=0.01 * np.eye(1),
+    )  # fmt: skip
+    applied, x = torch.tensor([mv]).double(), torch.zeros(1, dtype=torch.float64)
+    for _ in range(300):
+        x = model(torch.cat([x, applied]))
+    moved, _ = first_move(law_of(model), model.measured(x), applied)
+    assert moved.abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("where", PLACES)

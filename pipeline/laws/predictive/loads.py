@@ -81,13 +81,18 @@ def held_rest(model: Identified, loads: Loads) -> Tensor:
     small.
     """
     n_y, n_x, n_v = model.n_y, model.n_x, model.n_v
-    x, d = model.at_rest(model.y_center, model.v_center), torch.zeros(loads.count, dtype=torch.float64)
+    n_d, none = loads.count, torch.zeros(n_y, 1, dtype=torch.float64)
+    z = best = torch.cat([model.at_rest(model.y_center, model.v_center), torch.zeros(n_d, dtype=torch.float64)])
+    least = torch.inf
     for _ in range(NEWTON):
-        a, b = _slopes(model, x, loads.into_v @ d)
-        left = model(torch.cat([x, model.v_center + model.v_scale * (loads.into_v @ d)])) + loads.into_x @ d - x
-        moved = _resting(a, b, loads, torch.cat([left[:, None], torch.zeros(n_y, 1).double()]))[:, 0]
-        # A model that bends much may have no such rest: it stays near the middle of the record.
-        x, d = (torch.clamp(old + move, -AWAY, AWAY) for old, move in ((x, moved[:n_x]), (d, moved[n_x:])))
+        x, d = z[:n_x], z[n_x:]
+        v = model.v_center + model.v_scale * (loads.into_v @ d)
+        left = model(torch.cat([x, v])) + loads.into_x @ d - x
+        if not float(left.norm()) < least:  # a model that bends much may have no such rest
+            break
+        least, best = float(left.norm()), z
+        z = z + _resting(*_slopes(model, x, loads.into_v @ d), loads, torch.cat([left[:, None], none]))[:, 0]
+    x, d = best[:n_x], best[n_x:]
     a, b = _slopes(model, x, loads.into_v @ d)
     given = torch.cat([torch.zeros(n_x, n_y).double(), b], dim=1)
     outputs = torch.cat([torch.eye(n_y, dtype=torch.float64), torch.zeros(n_y, n_v).double()], dim=1)

@@ -167,6 +167,11 @@ class Observer(nn.Module):
             covariance = covariance - gain.reshape(*gain.shape[:-2], self.n_a, 1) * row
         return Estimate(mean, covariance, drift, squares), self.fall * boost
 
+    def ahead(self, mean: Tensor, v: Tensor) -> Tensor:
+        """[x, d] (..., 1, n_a) one period on under v."""
+        now = self.step(torch.cat([mean, v], dim=-1))
+        return product(torch.tanh(now["hidden"]), self.w2_t, now["next"]) if self.nonlinear else now["next"]
+
     def predicted(self, v: Tensor, past: Estimate) -> tuple[Tensor, Tensor]:
         """Mean and covariance one period on, before the measurement."""
         now = self.step(torch.cat([past.mean, v], dim=-1))

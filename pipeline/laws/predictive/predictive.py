@@ -139,8 +139,8 @@ class Predictive(ControlLaw):
             v = (torch.cat([p["mv"], p["dv"]], dim=-1) - model.v_center) / model.v_scale
             z = (p["mv"] - middle) / half
             one = torch.ones_like(z[..., :1])
+            given = torch.cat([y, v, one], dim=-1)
             past = [
-                torch.cat([y, v, one], dim=-1) @ rest.T,
                 one * first,
                 0 * y,
                 0 * y,
@@ -148,10 +148,12 @@ class Predictive(ControlLaw):
                 z.repeat(*(1 for _ in z.shape[:-1]), count // z.shape[-1]),
             ]
             sp = (p["sp"] - y_center[:n_cv]) / y_scale[:n_cv]
-            return {"y": y, "sp": sp, "z": z, "v": v, "past": torch.cat(past, dim=-1), "one": one}
+            starts = {"held": given @ rest.T, "free": given @ free.T}
+            return {"y": y, "sp": sp, "z": z, "v": v, **starts, "past": torch.cat(past, dim=-1), "one": one}
 
-        rest = held_rest(model, loads)
-        rest[:n_y] = torch.eye(*rest[:n_y].shape, dtype=torch.float64)  # rounding moves no output
+        rest, free = held_rest(model, loads), torch.cat([model.rest, torch.zeros(loads.count, model.rest.shape[1])])
+        for start in (rest, free):
+            start[:n_y] = torch.eye(*start[:n_y].shape, dtype=torch.float64)  # rounding moves no output
         signals = self.signals
         self.layout = {n: len(getattr(signals, n)) for n in ("sp", "pv", "dv", "mv")}
         self.inputs = AffineMap(self.layout, inputs)
@@ -237,6 +239,23 @@ class Predictive(ControlLaw):
         state_next = torch.cat([now["one"], estimate, plan, measured, *recipe], dim=-1).squeeze(-2)
         return self.limited(mv, mv_applied), state_next, torch.cat(info, dim=-1).squeeze(-2)
 
+    def _first(self, now: Named) -> Tensor:
+        """[x, d] (..., 1, n_a) without a past: a rest under loads, or without, which a network may hold better.
+
+        The loads are found with the slopes in the middle of the record; a network that bends much may rest by itself
+        elsewhere, where these would be wrong.
+        """
+        n_x, held = self.observer.n_x, now["held"]
+        loads = torch.minimum(torch.maximum(held[..., n_x:], -self.largest), self.largest)
+        held = torch.cat([held[..., :n_x], loads], dim=-1)
+        if not self.observer.nonlinear:
+            return held
+        moved = [
+            (self.observer.ahead(m, now["v"]) - m)[..., :n_x].square().sum(-1, keepdim=True)
+            for m in (held, now["free"])
+        ]
+        return torch.where(moved[0] <= moved[1], held, now["free"])
+
     def _estimated(self, now: Named, kept: Named) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """[x, d], the boost, what of the estimate goes to the next state, and the plan to begin at."""
         n_a, n_mv = self.observer.n_a, now["z"].shape[-1]
@@ -246,9 +265,7 @@ class Predictive(ControlLaw):
         seen, boost = self.observer(now["y"], acted, Estimate(kept["mean"], square, kept["drift"], kept["squares"]))
         flat = seen.covariance.flatten(-2).index_select(-1, self.upper).unsqueeze(-2)
         known = torch.cat([seen.mean, flat, seen.drift, seen.squares, kept["plan"] @ self.shift], dim=-1)
-        n_x, first = self.observer.n_x, now["past"]
-        loads = torch.minimum(torch.maximum(first[..., n_x:n_a], -self.largest), self.largest)
-        first = torch.cat([first[..., :n_x], loads, first[..., n_a:]], dim=-1)
+        first = torch.cat([self._first(now), now["past"]], dim=-1)
         past = torch.where(kept["started"] > 0, known, first)
         n_plan = self.moves.count
         return past[..., :n_a], kept["started"] * boost, past[..., :-n_plan], past[..., -n_plan:]
