@@ -169,19 +169,25 @@ class Observer(nn.Module):
 
     def ahead(self, mean: Tensor, v: Tensor) -> Tensor:
         """[x, d] (..., 1, n_a) one period on under v."""
-        now = self.step(torch.cat([mean, v], dim=-1))
-        return product(torch.tanh(now["hidden"]), self.w2_t, now["next"]) if self.nonlinear else now["next"]
+        return self._advanced(mean, v)[0]
 
     def predicted(self, v: Tensor, past: Estimate) -> tuple[Tensor, Tensor]:
         """Mean and covariance one period on, before the measurement."""
-        now = self.step(torch.cat([past.mean, v], dim=-1))
-        if not self.nonlinear:
-            return now["next"], self.f @ past.covariance @ self.f_t + self.q
-        t = torch.tanh(now["hidden"])
+        mean, t = self._advanced(past.mean, v)
+        if t is None:
+            return mean, self.f @ past.covariance @ self.f_t + self.q
         slope = 1.0 - t * t
         f = product(self.w2 * slope, self.w1, self.f)
         f_t = product(self.w1_t * slope, self.w2_t, self.f_t)
-        return product(t, self.w2_t, now["next"]), product(f @ past.covariance, f_t, self.q)
+        return mean, product(f @ past.covariance, f_t, self.q)
+
+    def _advanced(self, mean: Tensor, v: Tensor) -> tuple[Tensor, Tensor | None]:
+        """[x, d] one period on under v, and what the tanh units put out (None without them)."""
+        now = self.step(torch.cat([mean, v], dim=-1))
+        if not self.nonlinear:
+            return now["next"], None
+        t = torch.tanh(now["hidden"])
+        return product(t, self.w2_t, now["next"]), t
 
 
 def _with_loads(found: dict[str, Tensor], d: Tensor) -> dict[str, Tensor]:

@@ -250,11 +250,9 @@ class Predictive(ControlLaw):
         held = torch.cat([held[..., :n_x], loads], dim=-1)
         if not self.observer.nonlinear:
             return held
-        moved = [
-            (self.observer.ahead(m, now["v"]) - m)[..., :n_x].square().sum(-1, keepdim=True)
-            for m in (held, now["free"])
-        ]
-        return torch.where(moved[0] <= moved[1], held, now["free"])
+        moved = [(self.observer.ahead(m, now["v"]) - m)[..., :n_x] for m in (held, now["free"])]
+        size = [(m * m).sum(-1, keepdim=True) for m in moved]
+        return torch.where(size[0] <= size[1], held, now["free"])
 
     def _estimated(self, now: Named, kept: Named) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """[x, d], the boost, what of the estimate goes to the next state, and the plan to begin at."""

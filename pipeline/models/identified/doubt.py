@@ -7,14 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.historian.pace import MOST_PERIODS
 from pipeline.plants.simulator import Array
 from pipeline.tuning.responses import reached
 
 RISES = (0.1, 0.63)
 """Shares of its last value between which the time of a step response is its time constant; the first ends dead time."""
-
-AHEAD = 60
-"""Rows that a predictive law looks ahead at most: what an answer that goes on makes of later ones decides nothing."""
 
 GOES_ON = 0.1
 """Share of its last value that an answer gains in its last fifth, from which it goes on; a ramp gains a fifth."""
@@ -35,8 +33,9 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
     """From the models' scaled step responses (members, n_v, length, n_y), the MVs' first.
 
     Of each MV the output counts that it moves most. Speed and dead time are those of the MV that is least certain,
-    as all inputs of a plant share its dynamics. An answer that goes on is taken over ``AHEAD`` rows: a pole near 1 is
-    never certain, and what it makes of hundreds of rows hides how well the first ones are known.
+    as all inputs of a plant share its dynamics. An answer that goes on is taken over the rows that a predictive
+    law looks ahead at most: a pole near 1 is never certain, and what it makes of hundreds of rows hides how well the
+    first ones are known.
     """
     gain, pace, dead = np.zeros(n_mv), np.zeros(n_mv), np.zeros(n_mv)
     for j in range(n_mv):
@@ -44,7 +43,7 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
         found = curves[:, j, :, strongest]  # (members, length)
         usual = np.median(found, axis=0)
         if abs(usual[-1] - usual[-max(len(usual) // 5, 1)]) > GOES_ON * abs(usual[-1]):
-            found = found[:, :AHEAD]
+            found = found[:, :MOST_PERIODS]
         middle = float(np.median(found[:, -1]))
         if len(found) < 2 or middle == 0.0:
             continue

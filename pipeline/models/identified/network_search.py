@@ -112,17 +112,19 @@ def _seed(trial: Trial) -> int:
 
 
 def _offers(linear: Sequence[Structure], units: Sequence[int]) -> list[Structure]:
-    """Networks to try: units on the best balanced and lagged candidates, and on the smallest balanced ones.
+    """Networks to try: units on the best and the smallest balanced candidate, on the best lagged one, and on others.
 
-    Order and units are chosen together: the best linear order is that of the curve that it has to imitate.
+    Order and units are chosen together: the best linear order is that of the curve that it has to imitate. So the
+    smallest one comes second: a long record's budget does not carry many networks of many states.
     """
     first, second = list[Structure](), list[Structure]()
     for same_row in (False, True):
         balanced, lagged = (
             [s for s in linear if s.start == start and s.same_row is same_row] for start in ("balanced", "lagged")
         )
-        first += [*balanced[:1], *lagged[:1]]
-        second += [*sorted(balanced[1:], key=lambda s: s.order)[:SMALL], *lagged[1:2]]
+        small = sorted(balanced[1:], key=lambda s: s.order)[:SMALL]
+        first += [*balanced[:1], *small[:1], *lagged[:1]]
+        second += [*small[1:], *lagged[1:2]]
     bases = [*first, *second]
     middle = units[len(units) // 2]
     widest = [replace(b, n_hidden=middle, ridge=RIDGES[0]) for b in bases]

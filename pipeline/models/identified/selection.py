@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.models.identified.candidates import misses
+from pipeline.models.identified.candidates import misses, wild
 from pipeline.models.identified.curvature import curved
 from pipeline.models.identified.drift import Drift, drift_of
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
@@ -20,7 +20,7 @@ from pipeline.models.identified.structure import Problem
 from pipeline.models.identified.trial import Trial, best_of
 
 SETTLES = 0.98
-"""Slowest pole of a fold up to which it speaks for a plant that settles, where another fold's integrates."""
+"""Slowest pole of a fold up to which it speaks for a plant that settles, where another one integrates."""
 
 NEARLY = 1.02
 """Relative error up to which a linear model that settles stands in for one that integrates."""
@@ -111,7 +111,7 @@ def select(
         # Both conventions stay on offer: the networks' held-out error may decide otherwise than the linear models'.
         linear = smallest_first([*linear, *search.in_the_same_row(linear)])
     offered = linear if correction is not None else [_with_correction(t, 0.0) for t in linear]
-    settles = not _integrates(linear[0])
+    settles = _settles(rounds.problem, linear[0])
     networks = NetworkSearch(replace(rounds, problem=replace(rounds.problem, settles=settles)), offered)
     lacking = _misses(rounds.problem, linear[0], WHITE) or _curved(rounds.problem, linear[0])
     finalists = networks.finalists(units) if lacking else []
@@ -141,7 +141,7 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     """
     search = NoiseSearch.of(rounds)
     linear = _settling_first(rounds.problem, search.linear(orders))
-    settles = not _integrates(linear[0])
+    settles = _settles(rounds.problem, linear[0])
     search = replace(search, rounds=replace(rounds, problem=replace(rounds.problem, settles=settles)))
     networks = search.networks(linear, units)
     best = best_of(networks)
@@ -154,19 +154,22 @@ def _nearly(trial: Trial, best: Trial) -> bool:
 
 
 def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
-    """Where one fold's best integrates and another's settles, one that settles in all first, if it errs as little.
+    """Where the best integrates in a fold, one that settles in all first, if it errs as little.
 
-    A load that wanders and a state of the plant that drifts are hard to tell apart one row ahead. A plant that
-    integrates does so in each part of its record; a state that drifts in one alone is the load's, and leaves the plant
-    without a gain.
+    A load that wanders and a state of the plant that drifts are hard to tell apart one row ahead. A state that drifts
+    in one part of the record alone, or that a model of a quick plant does without, is the load's, and leaves the plant
+    without a gain. One that settles clearly goes before others; where all parts speak for an integrator it has to.
     """
     best = linear[0]
     slowest = [_slowest(best, fold) for fold in best.folds]
-    if max(slowest) <= INTEGRATES or min(slowest) > SETTLES:
+    if max(slowest) <= INTEGRATES:
         return linear
-    alike = (t for t in linear if t.against == best.against and nats(problem, t, best) <= NATS)
-    settling = next((t for t in alike if all(_slowest(t, fold) <= INTEGRATES for fold in t.folds)), None)
-    return linear if settling is None else [settling, *(t for t in linear if t is not settling)]
+    alike = [t for t in linear if t.against == best.against and nats(problem, t, best) <= NATS]
+    for limit in (SETTLES, INTEGRATES) if min(slowest) <= SETTLES else (SETTLES,):
+        settling = next((t for t in alike if all(_slowest(t, fold) <= limit for fold in t.folds)), None)
+        if settling is not None:
+            return [settling, *(t for t in linear if t is not settling)]
+    return linear
 
 
 def _trained(trial: Trial) -> float:
@@ -182,7 +185,16 @@ def _with_correction(trial: Trial, correction: float) -> Trial:
 
 
 def _integrates(trial: Trial) -> bool:
-    return _slowest(trial, trial.folds[0]) > INTEGRATES
+    return max(_slowest(trial, fold) for fold in trial.folds) > INTEGRATES
+
+
+def _settles(problem: Problem, trial: Trial) -> bool:
+    """Whether a linear model settles in every fold, by the test that networks have to pass.
+
+    A pole below ``INTEGRATES`` can be too slow for it: a test that the linear model fails rejects every network.
+    """
+    v, n_y = problem.data.v, problem.data.y.shape[1]
+    return not any(wild(trial.of_fold(fold)[0].model.plant, v, n_y) for fold in trial.folds)
 
 
 def _slowest(trial: Trial, fold: int) -> float:

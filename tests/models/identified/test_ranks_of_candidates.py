@@ -7,9 +7,10 @@ import numpy as np
 from pipeline.models.identified.dynamics import Dynamics
 from pipeline.models.identified.linear_search import smallest_first
 from pipeline.models.identified.linear_start import dead_times
+from pipeline.models.identified.network_search import _offers
 from pipeline.models.identified.output_error import Fitted
 from pipeline.models.identified.scaled_record import Fold
-from pipeline.models.identified.selection import _settling_first
+from pipeline.models.identified.selection import _settles, _settling_first
 from pipeline.models.identified.structure import Problem, Structure
 from pipeline.models.identified.trial import Trial
 
@@ -43,19 +44,48 @@ def test_an_output_that_an_input_does_not_move_says_nothing_of_its_dead_time() -
     assert dead_times(np.zeros((30, 1, 1)), np.ones(1)) == [0]
 
 
-def test_a_state_that_drifts_in_one_fold_alone_is_a_loads() -> None:
-    """And one that drifts in both is the plant's; so is one without which held-out rows are foreseen much worse."""
-    data = type("Rows", (), {"y": np.zeros((2_000, 1))})()
-    problem = Problem(data, (Fold(slice(0, 1_000), slice(1_000, 2_000)), Fold(slice(1_000, 2_000), slice(0, 1_000))), 1)  # type: ignore[arg-type]
+def two_folds() -> Problem:
+    """A record of two halves, each held out once."""
+    data = type("Rows", (), {"y": np.zeros((2_000, 1)), "v": np.linspace(-0.5, 0.5, 2_000)[:, None]})()
+    folds = (Fold(slice(0, 1_000), slice(1_000, 2_000)), Fold(slice(1_000, 2_000), slice(0, 1_000)))
+    return Problem(data, folds, 1)  # type: ignore[arg-type]
 
-    def trial(error: float, *poles: float) -> Trial:
-        return Trial(STRUCTURE, {(k, 0): fit(error, pole=pole) for k, pole in enumerate(poles)})
 
-    settles = trial(1.002, 0.9, 0.9)
-    for first, expected in (
-        (trial(1.0, 1.0, 0.9), settles),
-        (trial(1.0, 1.0, 0.9995), None),
-        (trial(1.0, 0.95, 0.9), None),
-        (trial(0.9, 1.0, 0.9), None),
+def trial(error: float, *poles: float) -> Trial:
+    """A candidate with a pole in each fold."""
+    return Trial(STRUCTURE, {(k, 0): fit(error, pole=pole) for k, pole in enumerate(poles)})
+
+
+def test_a_state_that_drifts_is_a_loads_where_a_model_that_settles_errs_as_little() -> None:
+    """In one fold alone any that settles will do, in both it has to settle clearly, and err as little."""
+    for first, other, settles in (
+        (trial(1.0, 1.0, 0.9), trial(1.002, 0.9, 0.9), True),
+        (trial(1.0, 1.0, 0.9), trial(1.002, 0.9, 0.99), True),
+        (trial(1.0, 1.0, 0.9995), trial(1.002, 0.9, 0.97), True),
+        (trial(1.0, 1.0, 0.9995), trial(1.002, 0.9, 0.99), False),
+        (trial(1.0, 0.95, 0.9), trial(1.002, 0.9, 0.9), False),
+        (trial(0.9, 1.0, 0.9), trial(1.002, 0.9, 0.9), False),
+        (trial(0.9, 1.0, 1.0), trial(1.002, 0.9, 0.9), False),
     ):
-        assert _settling_first(problem, [first, settles])[0] is (first if expected is None else expected)
+        assert _settling_first(two_folds(), [first, other])[0] is (other if settles else first)
+    clearly, hardly, first = trial(1.002, 0.9, 0.97), trial(1.001, 0.9, 0.99), trial(1.0, 1.0, 0.9)
+    assert _settling_first(two_folds(), [first, hardly, clearly])[0] is clearly
+
+
+def test_a_plant_settles_where_its_linear_model_passes_the_test_of_networks() -> None:
+    """A slow pole that is no integrator's fails it, and would reject every network; each fold counts."""
+    for poles, settles in (((0.9, 0.95), True), ((0.9987, 0.9), False), ((0.9, 0.9987), False), ((0.9, 1.0), False)):
+        assert _settles(two_folds(), trial(1.0, *poles)) is settles
+
+
+def test_networks_on_the_smallest_candidate_come_before_others_that_cost_more() -> None:
+    """A long record's budget carries the first ones alone."""
+
+    def balanced(order: int) -> Structure:
+        return Structure("balanced", order, (0, 0), (0,))
+
+    lagged = Structure("lagged", 4, (2, 3), (0,))
+    found = _offers([balanced(8), balanced(11), lagged, balanced(3), balanced(2)], (4, 8, 12))
+    assert [s.order for s in found[:3]] == [8, 2, 4]
+    assert {s.n_hidden for s in found[:3]} == {8}
+    assert [s.order for s in _offers([balanced(2), balanced(8)], (4,))[:2]] == [2, 8]
