@@ -7,7 +7,8 @@ defaults. The PID is tuned in closed loop on the true plant, with its noise; the
 state. Figures: mean absolute error in % of the set points' range, on random set points, after unmeasured loads at the
 MVs, and after upsets at the outputs, none of which anyone has seen, of the true output under measurement noise (of the
 NMPC without noise); travel in % of the MVs' range a sample, on set points. The method was chosen with the plants of
-DEVELOPMENT in sight; those of UNTOUCHED are reported as they come.
+DEVELOPMENT in sight; those of UNTOUCHED are reported as they come. ``--run`` sends the records through `loopwright new`
+and `loopwright run` instead, gates and all, and steps the files that are shipped; also of the plants of FURTHER.
 
 ``python benchmarks/own_plants --closed PLANT ... [--rows N] [--fit]``: the plants whose records were taken in closed
 loop, and what the product makes of the file of a historian (``closed_benchmark.py``); ``--closed development`` is the
@@ -31,7 +32,9 @@ from closed_development import CLOSED_DEVELOPMENT
 from closed_refused import KINDS, MINUTES, refused_main
 from closed_untouched import CLOSED_UNTOUCHED
 from development import DEVELOPMENT
+from further import FURTHER
 from loops import Score, closed, scores, tests_of
+from open_product import run_row
 from plant import OwnPlant
 from store import bound_of, model_of
 from untouched import UNTOUCHED
@@ -109,12 +112,13 @@ def _text(score: Score | None, of: str) -> str:
 
 def main(argv: list[str]) -> int:
     """Print a row a plant."""
-    plants = {p.name: p for p in (*DEVELOPMENT, *UNTOUCHED)}
+    plants = {p.name: p for p in (*DEVELOPMENT, *UNTOUCHED, *FURTHER)}
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("plants", nargs="*", choices=[[], *plants], help="(default: all)")
     parser.add_argument("--rows", type=int, help=f"of the record ({ROWS}, of --closed {CLOSED_ROWS})")
     parser.add_argument("--tuning", choices=["search", "given"], default="search", help="of the law (search)")
     add = parser.add_argument
+    add("--run", action="store_true", help="through `new` and `run`, to the files that are shipped")
     closed = [*PLANTS, *GROUPS]
     what = "plants in closed-loop records instead, through `new` and `run`"
     add("--closed", nargs="*", choices=closed, metavar="PLANT", help=f"{what}: {', '.join(closed)} (development)")
@@ -132,6 +136,10 @@ def main(argv: list[str]) -> int:
     if options.refused is not None:
         return refused_main(options.refused or list(KINDS), options.count, options.minutes)
     options.rows = options.rows or ROWS
+    if options.run:
+        for name in options.plants or plants:
+            print(run_row(plants[name](), options.rows)[0], flush=True)
+        return 0
     print(HEAD)
     found = []
     for name in options.plants or plants:

@@ -23,7 +23,7 @@ import plant as plant_module
 import torch
 from closed_development import CLOSED_DEVELOPMENT
 from closed_plant import ClosedPlant, closed_tests_of
-from closed_product import Delivered, by_fit, by_run, withheld
+from closed_product import Delivered, by_fit, by_run, columns_of, withheld
 from closed_record import OldLaw, closed_record_of, write_export
 from closed_untouched import CLOSED_UNTOUCHED
 from loops import Steps, closed, scores
@@ -130,7 +130,7 @@ def ours_of(plant: ClosedPlant, rows: int, *, fit: bool, seed: int = 0) -> dict[
         file = FOLDER / f"{key}-export" / f"{plant.name}.csv"
         write_export(plant, closed_record_of(plant, rows, seed), file)
         project = FOLDER / f"{key}-project"
-        done: Delivered = by_fit(plant, file) if fit else by_run(plant, file, project)
+        done: Delivered = by_fit(plant, file) if fit else by_run(plant, file, project, columns_of(plant))
         why = [] if fit else withheld(project, plant.name)
         of = {name: scored(law, plant) for name, law in done.laws.items()}
         where = "" if fit else str(project)

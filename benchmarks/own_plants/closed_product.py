@@ -18,6 +18,7 @@ import torch
 from closed_plant import ClosedPlant
 from closed_record import roles
 from loops import Steps
+from plant import OwnPlant
 from torch import Tensor
 
 from pipeline.commands import new
@@ -87,7 +88,7 @@ class Delivered:
     files: dict[str, Path] = field(default_factory=dict)
 
 
-def paced(plant: ClosedPlant, law: Steps, period_s: float) -> Steps:
+def paced(plant: OwnPlant, law: Steps, period_s: float) -> Steps:
     """The law at its own period on the plant."""
     periods = period_s / plant.period_s
     return law if abs(periods - 1) < 1e-6 else Paced(law, periods)
@@ -141,12 +142,26 @@ def by_fit(plant: ClosedPlant, file: Path) -> Delivered:
     return Delivered({"predictive": law}, said, time.process_time() - began)
 
 
-def by_run(plant: ClosedPlant, file: Path, project: Path) -> Delivered:
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """The options of `loopwright new` that say what a file's columns are, and their names in the plant's order."""
+
+    options: Sequence[str]
+    pv: Sequence[str]
+    mv: Sequence[str]
+
+
+def columns_of(plant: ClosedPlant) -> Columns:
+    """Of the file of a historian, as the plant's people would name them."""
+    return Columns(roles(plant), [f"{o.tag}.PV" for o in plant.loops], [f"{o.tag}.OP" for o in plant.loops])
+
+
+def by_run(plant: OwnPlant, file: Path, project: Path, columns: Columns) -> Delivered:
     """`loopwright new` and `loopwright run` in a fresh project, and the files that are shipped there."""
     _fresh(project)
     began = resource.getrusage(resource.RUSAGE_CHILDREN)
     shutil.copy(file, project / file.name)
-    code, said = _loopwright(project, "new", plant.name, file.name, *roles(plant))
+    code, said = _loopwright(project, "new", plant.name, file.name, *columns.options)
     if code == 0:
         code, more = _loopwright(project, "run", plant.name)
         said += more
@@ -156,17 +171,16 @@ def by_run(plant: ClosedPlant, file: Path, project: Path) -> Delivered:
         shutil.rmtree(project / package)
     files = {path.stem: path for path in sorted((project / "artifacts" / plant.name).glob("*.onnx"))}
     (project / "said.txt").write_text("\n".join(said), encoding="utf-8")
-    return Delivered({name: shipped(plant, path) for name, path in files.items()}, said, seconds, files)
+    return Delivered({name: shipped(plant, path, columns) for name, path in files.items()}, said, seconds, files)
 
 
-def shipped(plant: ClosedPlant, file: Path) -> Steps:
+def shipped(plant: OwnPlant, file: Path, columns: Columns) -> Steps:
     """A shipped file as a law for the plant; its signals must come in the plant's order."""
     law = Shipped(file)
     manifest = law.controller.manifest
-    wanted = {"pv": [f"{o.tag}.PV" for o in plant.loops], "mv": [f"{o.tag}.OP" for o in plant.loops]}
-    for role, names in wanted.items():
+    for role, names in (("pv", columns.pv), ("mv", columns.mv)):
         found = [s.name for s in manifest.signals(role)]
-        assert found == names, f"{file}: {role} is {found}, not {names}"
+        assert found == list(names), f"{file}: {role} is {found}, not {names}"
     return paced(plant, law, manifest.period_s)
 
 

@@ -16,7 +16,8 @@ from pipeline.config.exports import is_exported
 from pipeline.errors import PlantError, RecordError
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.grounds import RecordVerdict
-from pipeline.evaluation.model_evidence import identified_part
+from pipeline.evaluation.model_evidence import Metrics, identified_part
+from pipeline.evaluation.one_side import on_one_side
 from pipeline.files import read_json
 from pipeline.plants.identified import IdentifiedArrays
 from pipeline.plants.noise import deviation
@@ -69,7 +70,7 @@ class OwnEnsemble(Case):
     @cached_property
     def _model(self) -> OwnPlant:
         """The law's own model, begun at the median MVs that laws may command."""
-        return self._member(self._law_file, visited_mv(self.record, self.signals.mv)[1])
+        return self._member(self._law_file, visited_mv(self.record, self.commanded.mv)[1])
 
     @cached_property
     def members(self) -> tuple[OwnPlant, ...]:
@@ -90,7 +91,7 @@ class OwnEnsemble(Case):
             noise = deviation(file["noise"] * file["y_scale"], colour)
         dv = np.median(self.record.dv, axis=0)
         most = int(np.ceil(max(doubts.dead, self._doubts.dead)))
-        plant = OwnPlant(self.signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
+        plant = OwnPlant(self.commanded, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
         plant.noise, plant.colour, plant.doubts = noise, colour, doubts
         return plant
 
@@ -132,11 +133,20 @@ class OwnEnsemble(Case):
         return {s.name: (float(v.min()), float(v.max())) for s, v in pairs}
 
     @cached_property
+    def commanded(self) -> Signals:
+        """The signals of the laws: the MV ends where the record proves that its gain turns."""
+        return on_one_side(self.signals, self._figures.get("proof") or {}, float(np.median(self.record.mv[:, 0])))
+
+    @property
     def same_row(self) -> bool:
         """Whether an MV of the record acts on the outputs of its own row, by the models."""
+        return bool((self._figures.get("structure") or {}).get("same_row"))
+
+    @cached_property
+    def _figures(self) -> Metrics:
+        """The figures of the law's model; none before it is trained."""
         figures = self.models.parent / "metrics.json"
-        known = identified_part({"": read_json(figures)}) if figures.is_file() else {}
-        return bool((known.get("structure") or {}).get("same_row"))
+        return identified_part({"": read_json(figures)}) if figures.is_file() else {}
 
     @cached_property
     def set_points(self) -> Array | None:

@@ -141,12 +141,23 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
         holds = little or _holds(found, known, shown=foreseen)
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
         because = LITTLE if little else _word(found, known, holds=holds) or _why(pv, mv, found)
+    because = "; ".join(filter(None, (because, _side(mv, found))))
     return Statement(
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         limit,
         "; ".join([*([] if by_region else [_measured(found)]), *_regions(mv, found)]),
         holds,
         because,
+    )
+
+
+def _side(mv: str, found: Mapping[str, Any]) -> str:
+    """Which values of an MV whose gain turns controllers of one MV are kept from; empty where it does not."""
+    signs = {r["model"] > 0 for r in found.get("regions") or () if not r["small"] and r["verdict"] == "proven"}
+    return (
+        f"a controller of {mv} alone stays on the side of the turn where the record mostly was"
+        if len(signs) > 1
+        else ""
     )
 
 

@@ -69,6 +69,7 @@ def step_responses_picture(evidence: Evidence) -> Canvas:
             axes.fill_between(time, low, high, color=LAW, alpha=0.25, linewidth=0, label="band of all good fits")
             axes.plot(time, middle, color=LAW, linewidth=1.4, label="their middle")
             axes.axhline(0.0, color="#888888", linewidth=0.7)
+            axes.set_ylim(*_heights(middle, low, high))
             waits = dead.get(signal.name, 0.0) * plant.period_s
             if waits:
                 axes.axvline(time[-1] * waits / (plant.period_s * found["periods"][-1]), color=PALETTE[0],
@@ -82,6 +83,16 @@ def step_responses_picture(evidence: Evidence) -> Canvas:
     _legend(canvas, panels)
     fit_labels(canvas, titles)
     return canvas
+
+
+def _heights(middle: Array, low: Array, high: Array) -> tuple[float, float]:
+    """Ends of the axis of a response: its band, as far as that is no wider than the response on either side.
+
+    Of an integrator some likely fits run away in the end, and a band of many powers of ten would hide the response.
+    """
+    room = float(np.ptp(middle)) or float(np.ptp(np.r_[low, high])) or 1.0
+    bottom, top = max(low.min(), middle.min() - room), min(high.max(), middle.max() + room)
+    return bottom - 0.05 * room, top + 0.05 * room
 
 
 def gains_picture(evidence: Evidence) -> Canvas:

@@ -1,0 +1,55 @@
+"""The side of a turn on which controllers stay: where an MV's gain turns its sign, a loop beyond it locks up.
+
+A controller that goes over the top of a curve moves the MV on and on, as each move makes its error larger. The values
+that it gives up are reached on its own side too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import takewhile
+from typing import Any
+
+from pipeline.plants.signals import Signals
+
+Regions = Sequence[Mapping[str, Any]]
+
+
+def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Signals:
+    """The signals of a plant of one MV, whose range ends where the gain turns; the same where it does not.
+
+    ``proof`` of the model's figures has the regions of the MV's range by the gain there; ``median`` is that of the MV
+    in the record. Plants of several MVs stay as they are: what one cannot do there the others may.
+    """
+    if len(signals.mv) != 1 or len(signals.sp) != 1:
+        return signals
+    mv = signals.mv[0]
+    found = ((proof.get("answers") or {}).get(signals.sp[0].name) or {}).get(mv.name) or {}
+    low, high = side_of(found.get("regions") or (), median)
+    low, high = (mv.low if low is None else max(low, mv.low)), (mv.high if high is None else min(high, mv.high))
+    return replace(signals, mv=(replace(mv, low=low, high=high),)) if low < high else signals
+
+
+def side_of(regions: Regions, median: float) -> tuple[float | None, float | None]:
+    """(lowest, highest) value of an MV on the side of a turn where it mostly was; None where there is no turn.
+
+    A turn lies between two regions whose gains the record proves, and which are of opposite signs.
+    """
+    proven = [i for i, of in enumerate(regions) if not of["small"] and of["verdict"] == "proven"]
+    if not proven:
+        return None, None
+    own = min(proven, key=lambda i: _distance(regions[i], median))
+    sign = regions[own]["model"] > 0
+
+    def end(order: Sequence[int], key: str) -> float | None:
+        alike = list(takewhile(lambda i: i not in proven or (regions[i]["model"] > 0) is sign, order))
+        last = max((i for i in (own, *alike) if i in proven), key=lambda i: abs(i - own))
+        return None if len(alike) == len(order) else float(regions[last][key])
+
+    return end(range(own - 1, -1, -1), "from"), end(range(own + 1, len(regions)), "to")
+
+
+def _distance(region: Mapping[str, Any], value: float) -> float:
+    """How far a value lies outside a region."""
+    return max(float(region["from"]) - value, value - float(region["to"]), 0.0)

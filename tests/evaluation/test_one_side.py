@@ -1,0 +1,66 @@
+"""The side of a turn on which controllers stay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pipeline.evaluation.one_side import on_one_side, side_of
+from pipeline.plants.signals import Signals
+from serving.manifest import Signal
+
+PV, MV = Signal("y", "K", 0.0, 100.0), Signal("u", "%", 0.0, 100.0)
+ONE = Signals(10.0, (PV,), (PV,), (), (MV,))
+
+
+def region(start: float, end: float, model: float, *, small: bool = False, verdict: str = "proven") -> dict[str, Any]:
+    """A region of the MV's range as the model's figures hold it."""
+    return {"from": start, "to": end, "model": model, "small": small, "verdict": verdict}
+
+
+HILL = [region(10, 30, 2.0), region(30, 60, 1.0), region(60, 90, -3.0)]
+VALLEY = [region(10, 40, -2.0), region(40, 50, 0.1, small=True), region(50, 90, 3.0)]
+
+
+@pytest.mark.parametrize(
+    ("regions", "median", "side"),
+    [
+        (HILL, 45.0, (None, 60.0)),
+        (HILL, 80.0, (60.0, None)),
+        (HILL, 5.0, (None, 60.0)),
+        (VALLEY, 20.0, (None, 40.0)),
+        (VALLEY, 45.0, (None, 40.0)),
+        (VALLEY, 70.0, (50.0, None)),
+        ([region(10, 30, -1.0), region(30, 60, 1.0), region(60, 90, -3.0)], 45.0, (30.0, 60.0)),
+        ([region(10, 60, 1.0), region(60, 90, 0.1, small=True)], 45.0, (None, None)),
+        ([region(10, 60, 1.0), region(60, 90, -1.0, verdict="uncertain")], 45.0, (None, None)),
+        ([region(10, 60, 1.0, verdict="uncertain"), region(60, 90, -1.0, verdict="uncertain")], 45.0, (None, None)),
+        ([], 45.0, (None, None)),
+    ],
+)
+def test_a_side_ends_where_the_gain_turns_and_the_record_proves_both_signs(
+    regions: list[dict[str, Any]], median: float, side: tuple[float | None, float | None]
+) -> None:
+    assert side_of(regions, median) == side
+
+
+def test_the_mv_of_a_plant_ends_at_the_turn_and_nothing_else_changes() -> None:
+    proof = {"answers": {"y": {"u": {"regions": HILL}}}}
+    found = on_one_side(ONE, proof, 45.0)
+    assert (found.mv[0].low, found.mv[0].high) == (0.0, 60.0)
+    assert (found.sp, found.pv, found.period_s) == (ONE.sp, ONE.pv, ONE.period_s)
+    assert on_one_side(ONE, {}, 45.0) == ONE
+
+
+def test_a_narrower_range_that_a_person_gave_stays_and_no_side_of_it_means_no_change() -> None:
+    proof = {"answers": {"y": {"u": {"regions": HILL}}}}
+    given = Signals(10.0, (PV,), (PV,), (), (Signal("u", "%", 20.0, 50.0),))
+    assert on_one_side(given, proof, 45.0) == given
+    beyond = Signals(10.0, (PV,), (PV,), (), (Signal("u", "%", 70.0, 90.0),))
+    assert on_one_side(beyond, proof, 45.0) == beyond
+
+
+def test_a_plant_of_several_mvs_keeps_its_ranges() -> None:
+    several = Signals(10.0, (PV,), (PV,), (), (MV, Signal("w", "%", 0.0, 100.0)))
+    assert on_one_side(several, {"answers": {"y": {"u": {"regions": HILL}}}}, 45.0) == several
