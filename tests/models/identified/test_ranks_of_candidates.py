@@ -48,7 +48,7 @@ def two_folds() -> Problem:
     """A record of two halves, each held out once."""
     data = type("Rows", (), {"y": np.zeros((2_000, 1)), "v": np.linspace(-0.5, 0.5, 2_000)[:, None]})()
     folds = (Fold(slice(0, 1_000), slice(1_000, 2_000)), Fold(slice(1_000, 2_000), slice(0, 1_000)))
-    return Problem(data, folds, 1)  # type: ignore[arg-type]
+    return Problem(data, folds, 1)
 
 
 def trial(error: float, *poles: float) -> Trial:
