@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from pipeline.config.plants import mistakes_of_mv
@@ -35,11 +36,21 @@ def commanded(inputs: Sequence[InputReport], tags: Sequence[Tag]) -> list[InputR
     return [replace(i, low=low, high=high) for i, (low, high) in zip(inputs, ends, strict=True)]
 
 
-def confirmed(signals: Sequence[Signal], tags: Sequence[Tag]) -> list[str]:
-    """What the controller may command, a line for each MV of which a person said it."""
+def confirmed(signals: Sequence[Signal], tags: Sequence[Tag], operated: Collection[str] = ()) -> list[str]:
+    """What the controller may command, a line for each MV of which a person said it.
+
+    And one for each of the ``operated`` MVs of which nobody did: the output of its old controller may have had limits,
+    for a reason that no record shows.
+    """
     lines = []
     for s in signals:
-        limits = next((t.commands for t in tags if t.name == s.name), {})
+        tag = next((t for t in tags if t.name == s.name), None)
+        limits = {} if tag is None else tag.commands
+        if tag is not None and not limits and s.name in operated:
+            lines.append(
+                f"{s.name}: the controller may command all of {s.low:g} to {s.high:g} {s.unit}; where the old "
+                f"controller's output is limited, say so: --command {shlex.quote(f'{tag.tag}=LOW..HIGH')}"
+            )
         if limits:
             low, high = commanded_range(s, tags)
             fastest = limits.get("max_move_per_min")
