@@ -142,7 +142,7 @@ def main(argv: list[str]) -> int:
         return 0
     print(HEAD)
     found = []
-    for name in options.plants or plants:
+    for name in options.plants or [p.name for p in (*DEVELOPMENT, *UNTOUCHED)]:
         found.append(row_of(plants[name](), options.rows, options.tuning))
         print(found[-1].text, flush=True)
     over = [row.over_bound for row in found if np.isfinite(row.over_bound)]

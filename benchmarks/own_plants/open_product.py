@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import tempfile
 import time
 from datetime import timedelta
 from pathlib import Path
@@ -14,9 +13,7 @@ from closed_record import START
 from loops import closed, scores, tests_of
 from plant import OwnPlant
 from record import record_of
-from store import bound_of
-
-FOLDER = Path(tempfile.gettempdir()) / "loopwright_own_plants"
+from store import FOLDER, bound_of
 
 
 def columns_of(plant: OwnPlant) -> Columns:

@@ -33,7 +33,7 @@ MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
 class OwnEnsemble(Case):
     """A case whose plants are the models of a record; its subclass tests laws on them."""
 
-    signals: ClassVar[Signals]  # the MVs with the ranges that laws command
+    signals: ClassVar[Signals]  # the MVs with the ranges that laws may command, see ``commanded``
     record_signals: ClassVar[Signals]  # the MVs with the ranges of their readings
     models: ClassVar[Path]
     data: ClassVar[Path]
@@ -135,14 +135,15 @@ class OwnEnsemble(Case):
     @cached_property
     def commanded(self) -> Signals:
         """The signals of the laws: the MV ends where the record proves that its gain turns."""
-        return on_one_side(self.signals, self._figures.get("proof") or {}, float(np.median(self.record.mv[:, 0])))
+        median = float(visited_mv(self.record, self.signals.mv)[1][0])
+        return on_one_side(self.signals, self._figures.get("proof") or {}, median)
 
     @property
     def same_row(self) -> bool:
         """Whether an MV of the record acts on the outputs of its own row, by the models."""
         return bool((self._figures.get("structure") or {}).get("same_row"))
 
-    @cached_property
+    @property
     def _figures(self) -> Metrics:
         """The figures of the law's model; none before it is trained."""
         figures = self.models.parent / "metrics.json"

@@ -80,7 +80,7 @@ class SimulatedCase(OwnCase):
     def _held(self, name: str, load: float) -> float:
         """The load on an MV, no larger than what the MV can take back within its range."""
         i = list(self.simulator.parameter_names()).index(name)
-        signal, at = self.signals.mv[i], float(self.simulator.start[1][i])
+        signal, at = self.commanded.mv[i], float(self.simulator.start[1][i])
         room = ROOM * (signal.high - signal.low)
         return float(np.clip(load, min(at - signal.high + room, 0.0), max(at - signal.low - room, 0.0)))
 

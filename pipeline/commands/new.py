@@ -227,7 +227,7 @@ def _write(
     if report.operated:
         for line in loop_lines(tags):
             print(plain(f"{line}; is it so? Column loop of the table of tags corrects it"))
-    for line in confirmed(found.record.mv_signals, tags, {mv for loop in report.operated for mv in loop.travel}):
+    for line in confirmed(found.record.mv_signals, tags, {old.mv for old in report.old_controllers}):
         print(line)
     for line in (*(f"you know of {one.pair}: {one.says}" for one in known), *questions):
         print(line)

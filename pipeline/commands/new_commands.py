@@ -46,7 +46,7 @@ def confirmed(signals: Sequence[Signal], tags: Sequence[Tag], operated: Collecti
     for s in signals:
         tag = next((t for t in tags if t.name == s.name), None)
         limits = {} if tag is None else tag.commands
-        if tag is not None and not limits and s.name in operated:
+        if tag is not None and not {"command_low", "command_high"} & set(limits) and s.name in operated:
             lines.append(
                 f"{s.name}: the controller may command all of {s.low:g} to {s.high:g} {s.unit}; where the old "
                 f"controller's output is limited, say so: --command {shlex.quote(f'{tag.tag}=LOW..HIGH')}"

@@ -1,7 +1,6 @@
 """The side of a turn on which controllers stay: where an MV's gain turns its sign, a loop beyond it locks up.
 
-A controller that goes over the top of a curve moves the MV on and on, as each move makes its error larger. The values
-that it gives up are reached on its own side too.
+A controller that goes over the top of a curve moves the MV on and on, as each move makes its error larger.
 """
 
 from __future__ import annotations
@@ -13,6 +12,8 @@ from typing import Any
 
 from pipeline.plants.signals import Signals
 
+LEAST = 0.1  # of the range that may be commanded, that a side must leave
+
 Regions = Sequence[Mapping[str, Any]]
 
 
@@ -20,7 +21,8 @@ def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Si
     """The signals of a plant of one MV, whose range ends where the gain turns; the same where it does not.
 
     ``proof`` of the model's figures has the regions of the MV's range by the gain there; ``median`` is that of the MV
-    in the record. Plants of several MVs stay as they are: what one cannot do there the others may.
+    in the record, within the range that may be commanded. Plants of several MVs stay as they are: what one cannot do
+    there the others may. So does a plant of which less than ``LEAST`` of its range would be left.
     """
     if len(signals.mv) != 1 or len(signals.sp) != 1:
         return signals
@@ -28,13 +30,15 @@ def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Si
     found = ((proof.get("answers") or {}).get(signals.sp[0].name) or {}).get(mv.name) or {}
     low, high = side_of(found.get("regions") or (), median)
     low, high = (mv.low if low is None else max(low, mv.low)), (mv.high if high is None else min(high, mv.high))
-    return replace(signals, mv=(replace(mv, low=low, high=high),)) if low < high else signals
+    enough = high - low >= LEAST * (mv.high - mv.low)
+    return replace(signals, mv=(replace(mv, low=low, high=high),)) if enough else signals
 
 
 def side_of(regions: Regions, median: float) -> tuple[float | None, float | None]:
     """(lowest, highest) value of an MV on the side of a turn where it mostly was; None where there is no turn.
 
-    A turn lies between two regions whose gains the record proves, and which are of opposite signs.
+    A turn lies between two regions whose gains the record proves, and which are of opposite signs. A small region
+    between them is left out, but for values up to the median.
     """
     proven = [i for i, of in enumerate(regions) if not of["small"] and of["verdict"] == "proven"]
     if not proven:
@@ -47,7 +51,8 @@ def side_of(regions: Regions, median: float) -> tuple[float | None, float | None
         last = max((i for i in (own, *alike) if i in proven), key=lambda i: abs(i - own))
         return None if len(alike) == len(order) else float(regions[last][key])
 
-    return end(range(own - 1, -1, -1), "from"), end(range(own + 1, len(regions)), "to")
+    low, high = end(range(own - 1, -1, -1), "from"), end(range(own + 1, len(regions)), "to")
+    return (None if low is None else min(low, median)), (None if high is None else max(high, median))
 
 
 def _distance(region: Mapping[str, Any], value: float) -> float:

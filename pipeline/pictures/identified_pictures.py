@@ -90,7 +90,7 @@ def _heights(middle: Array, low: Array, high: Array) -> tuple[float, float]:
 
     Of an integrator some likely fits run away in the end, and a band of many powers of ten would hide the response.
     """
-    room = float(np.ptp(middle)) or float(np.ptp(np.r_[low, high])) or 1.0
+    room = float(np.ptp(middle)) or float(np.median(high - low)) or 1.0
     bottom, top = max(low.min(), middle.min() - room), min(high.max(), middle.max() + room)
     return bottom - 0.05 * room, top + 0.05 * room
 

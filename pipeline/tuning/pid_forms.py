@@ -27,6 +27,7 @@ class PidForms:
     kd: float  # [mv s/pv]
     series: tuple[float, float, float] | None  # Kc', Ti' [s], Td' [s]
     band_percent: float
+    spans: tuple[float, float]  # of PV and MV that the band is of
 
     @classmethod
     def of(cls, settings: PidSettings, pv_span: float, mv_span: float) -> PidForms:
@@ -36,7 +37,7 @@ class PidForms:
         if td and isfinite(ti):
             root = sqrt(1 - 4 * td / ti) if ti >= 4 * td else None
             series = None if root is None else (kc * (1 + root) / 2, ti * (1 + root) / 2, ti * (1 - root) / 2)
-        return cls(kc, ti, td, kc / ti, kc * td, series, 100 * mv_span / pv_span / abs(kc))
+        return cls(kc, ti, td, kc / ti, kc * td, series, 100 * mv_span / pv_span / abs(kc), (pv_span, mv_span))
 
     def words(self, pv_unit: str, mv_unit: str) -> str:
         """The forms beside the ideal one, in one clause."""
@@ -51,7 +52,8 @@ class PidForms:
         else:
             kc, ti, td = self.series
             series = f"series form: Kc {kc:.4g} {per}, {_times(ti, td)}"
-        band = f"proportional band {self.band_percent:.4g} % of the ranges in params.yaml"
+        whole = [f"{span:.4g} {of}".rstrip() for span, of in zip(self.spans, (pv_unit, mv_unit), strict=True)]
+        band = f"proportional band {self.band_percent:.4g} % where {' and '.join(whole)} are the whole ranges"
         return f"{parallel}; {series}; {band}; {_minutes(self.ti_s, self.td_s)}"
 
 

@@ -30,7 +30,8 @@ VALLEY = [region(10, 40, -2.0), region(40, 50, 0.1, small=True), region(50, 90, 
         (HILL, 80.0, (60.0, None)),
         (HILL, 5.0, (None, 60.0)),
         (VALLEY, 20.0, (None, 40.0)),
-        (VALLEY, 45.0, (None, 40.0)),
+        (VALLEY, 45.0, (None, 45.0)),
+        (VALLEY, 47.0, (47.0, None)),
         (VALLEY, 70.0, (50.0, None)),
         ([region(10, 30, -1.0), region(30, 60, 1.0), region(60, 90, -3.0)], 45.0, (30.0, 60.0)),
         ([region(10, 60, 1.0), region(60, 90, 0.1, small=True)], 45.0, (None, None)),
@@ -57,8 +58,9 @@ def test_a_narrower_range_that_a_person_gave_stays_and_no_side_of_it_means_no_ch
     proof = {"answers": {"y": {"u": {"regions": HILL}}}}
     given = Signals(10.0, (PV,), (PV,), (), (Signal("u", "%", 20.0, 50.0),))
     assert on_one_side(given, proof, 45.0) == given
-    beyond = Signals(10.0, (PV,), (PV,), (), (Signal("u", "%", 70.0, 90.0),))
-    assert on_one_side(beyond, proof, 45.0) == beyond
+    beyond = Signals(10.0, (PV,), (PV,), (), (Signal("u", "%", 59.0, 100.0),))
+    assert on_one_side(beyond, proof, 45.0) == beyond  # a sliver would be left
+    assert on_one_side(beyond, proof, 75.0).mv[0].low == 60.0
 
 
 def test_a_plant_of_several_mvs_keeps_its_ranges() -> None:

@@ -26,9 +26,6 @@ from pipeline.plants.simulator import Array
 RESPONSE = 120
 """Samples of the high-order ARX's impulse response that are realized."""
 
-WILD = 20.0
-"""Scaled output that no rest of a usable network exceeds."""
-
 
 BEGIN, EASED = 15, 0.05
 """Iterations of each step in which a network's fit begins, and the correction of the runs of one of them."""
@@ -42,8 +39,8 @@ PATIENCE = 30
 AROUND = 1.5
 """Distance of the states from their middle, over that of the visited ones, from which a usable network returns."""
 
-RESTS = 0.9
-"""Least share of constant inputs under which a usable network comes to rest."""
+HELD, RESTS = 60, 0.9
+"""Inputs that are held, and the least share of them under which a usable network comes to rest."""
 
 
 # ---------------------------------------------------------------------- starts
@@ -96,7 +93,7 @@ def fit(problem: Problem, task: Task) -> Fitted | str:
         fitted = kinds[noise, network](problem, task)
     except ModelError as error:
         return str(error)
-    if network and problem.settles and wild(fitted.model.plant, problem.data.v, problem.data.y.shape[1]):
+    if network and problem.settles and wild(fitted.model.plant, problem):
         fitted = replace(fitted, held_out=np.inf)
     return _beside_what_is_known(problem, fitted)
 
@@ -227,9 +224,7 @@ def _on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitt
     for iterations in (30, 8, 2):
         fitter = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
         found = fitter.fit(fitted.model, whole)
-        if not (
-            problem.settles and found.model.n_hidden and wild(found.model, problem.data.v, problem.data.y.shape[1])
-        ):
+        if not (problem.settles and found.model.n_hidden and wild(found.model, problem)):
             return found
     return fitted
 
@@ -251,7 +246,7 @@ def _with_noise_on_all_rows(problem: Problem, structure: Structure, fitted: Fitt
         fitter = PredictionError(iterations=iterations, ridge=structure.ridge)
         found = fitter.fit(model, whole, gain_alone=structure.noise == "gain")
         bent = found.model.n_hidden > 0
-        if not (bent and problem.settles and wild(found.model.plant, problem.data.v, problem.data.y.shape[1])):
+        if not (bent and problem.settles and wild(found.model.plant, problem)):
             return found
     return fitted
 
@@ -292,21 +287,33 @@ def visited(model: Dynamics, train: list[Stretch], correction: float) -> Array:
     return np.concatenate(found)
 
 
-def wild(model: Dynamics, v: Array, n_y: int) -> bool:
-    """Whether the model does not settle over the inputs v (N, n_v) of the data.
+def wild(model: Dynamics, problem: Problem) -> bool:
+    """Whether the model does not settle over the inputs of the data.
 
     That is: an output goes beyond all bounds under one of them held constant, or swings under a tenth of them, or does
     not come back from states far outside the visited ones while the inputs change.
     """
-    rows = np.linspace(0, len(v) - 1, 60).astype(np.int64)
-    x, still = settle(model, v[rows])
-    if not np.abs(x[:, :n_y]).max() < WILD or still.mean() < RESTS:
+    n_y, v = problem.data.y.shape[1], _held_inputs(problem)
+    x, share = rests_under(model, problem)
+    if not np.abs(x[:, :n_y]).max() < problem.farthest or share < RESTS:
         return True
     middle = np.median(x, axis=0)
     x = middle + AROUND * (x - middle)
-    for shift in range(0, 60, 7):
-        x, _ = model.hold(x, v[np.roll(rows, shift)], 100)
-    return not np.abs(x[:, :n_y]).max() < WILD
+    for shift in range(0, len(v), 7):
+        x, _ = model.hold(x, np.roll(v, -shift, axis=0), 100)
+    return not np.abs(x[:, :n_y]).max() < problem.farthest
+
+
+def rests_under(model: Dynamics, problem: Problem) -> tuple[Array, float]:
+    """(states (n, n_x) a long time after inputs of the data were held, the share of them that stand still)."""
+    x, still = settle(model, _held_inputs(problem))
+    return x, float(still.mean())
+
+
+def _held_inputs(problem: Problem) -> Array:
+    """Inputs (n, n_v) of the data, spread evenly over its rows."""
+    v = problem.data.v
+    return v[np.linspace(0, len(v) - 1, HELD).astype(np.int64)]
 
 
 def misses(model: Dynamics, starts: list[Array], train: list[Stretch], ratio: float, correction: float) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.models.identified.candidates import misses, wild
+from pipeline.models.identified.candidates import RESTS, misses, rests_under
 from pipeline.models.identified.curvature import curved
 from pipeline.models.identified.drift import Drift, drift_of
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
@@ -16,7 +16,7 @@ from pipeline.models.identified.noise_search import NATS, NoiseSearch, nats
 from pipeline.models.identified.rests import INTEGRATES
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.row_convention import may_act_in_its_row
-from pipeline.models.identified.structure import Problem
+from pipeline.models.identified.structure import FARTHEST, Problem
 from pipeline.models.identified.trial import Trial, best_of
 
 SETTLES = 0.98
@@ -25,8 +25,11 @@ SETTLES = 0.98
 NEARLY = 1.02
 """Relative error up to which a linear model that settles stands in for one that integrates."""
 
+FARTHER = 2.0
+"""Times the largest rest of the linear model up to which rests of a network may lie."""
+
 SLOW = 0.05
-"""That correction."""
+"""Correction of training runs that is tried where the linear model integrates, or the best network misses much."""
 
 DRIFTS = 1.5
 """Residual over noise of the best network above which the correction is tried."""
@@ -49,6 +52,7 @@ class Selection:
     settles: bool  # whether the linear model comes to rest by itself
     drifts: bool  # whether gain or level move inside the record
     innovations: float | None = None  # nats by which one-step errors prefer the network; None: free runs judged
+    farthest: float = FARTHEST  # scaled: where rests of a network may lie
 
     @property
     def nonlinear(self) -> bool:
@@ -111,8 +115,8 @@ def select(
         # Both conventions stay on offer: the networks' held-out error may decide otherwise than the linear models'.
         linear = smallest_first([*linear, *search.in_the_same_row(linear)])
     offered = linear if correction is not None else [_with_correction(t, 0.0) for t in linear]
-    settles = _settles(rounds.problem, linear[0])
-    networks = NetworkSearch(replace(rounds, problem=replace(rounds.problem, settles=settles)), offered)
+    problem = _as_its_linear_model(rounds.problem, linear[0])
+    networks = NetworkSearch(replace(rounds, problem=problem), offered)
     lacking = _misses(rounds.problem, linear[0], WHITE) or _curved(rounds.problem, linear[0])
     finalists = networks.finalists(units) if lacking else []
     best = best_of(finalists)
@@ -131,7 +135,8 @@ def select(
         linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
         linear = smallest_first(rounds.judged_beyond_drift(linear, drift.rows))
         finalists = rounds.judged_beyond_drift(finalists, drift.rows)
-    return Selection(linear[0], best_of(finalists), [*linear, *finalists], rounds.budget.spent, settles, drifting)
+    every, spent = [*linear, *finalists], rounds.budget.spent
+    return Selection(linear[0], best_of(finalists), every, spent, problem.settles, drifting, None, problem.farthest)
 
 
 def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) -> Selection:
@@ -140,13 +145,17 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     Free runs would rank them by how they read the controller backwards, and by the loads that nobody measures.
     """
     search = NoiseSearch.of(rounds)
-    linear = _settling_first(rounds.problem, search.linear(orders))
-    settles = _settles(rounds.problem, linear[0])
-    search = replace(search, rounds=replace(rounds, problem=replace(rounds.problem, settles=settles)))
+    ranked = search.linear(orders)
+    linear = _settling_first(rounds.problem, ranked)
+    problem = _as_its_linear_model(rounds.problem, linear[0])
+    search = replace(search, rounds=replace(rounds, problem=problem))
     networks = search.networks(linear, units)
     best = best_of(networks)
-    gained = 0.0 if best is None else nats(rounds.problem, linear[0], best)
-    return Selection(linear[0], best, [*linear, *networks], rounds.budget.spent, settles, False, gained)
+    # Nothing is gained by what the linear model gave away to settle.
+    rival = min((ranked[0], linear[0]), key=lambda t: t.rank)
+    gained = 0.0 if best is None else nats(rounds.problem, rival, best)
+    every, spent = [*linear, *networks], rounds.budget.spent
+    return Selection(linear[0], best, every, spent, problem.settles, False, gained, problem.farthest)
 
 
 def _nearly(trial: Trial, best: Trial) -> bool:
@@ -158,7 +167,7 @@ def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
 
     A load that wanders and a state of the plant that drifts are hard to tell apart one row ahead. A state that drifts
     in one part of the record alone, or that a model of a quick plant does without, is the load's, and leaves the plant
-    without a gain. One that settles clearly goes before others; where all parts speak for an integrator it has to.
+    without a gain. One that settles clearly goes before others, and alone where all parts show a pole at 1.
     """
     best = linear[0]
     slowest = [_slowest(best, fold) for fold in best.folds]
@@ -188,13 +197,17 @@ def _integrates(trial: Trial) -> bool:
     return max(_slowest(trial, fold) for fold in trial.folds) > INTEGRATES
 
 
-def _settles(problem: Problem, trial: Trial) -> bool:
-    """Whether a linear model settles in every fold, by the test that networks have to pass.
+def _as_its_linear_model(problem: Problem, trial: Trial) -> Problem:
+    """The problem with the test that networks have to pass, which the linear model must pass itself.
 
-    A pole below ``INTEGRATES`` can be too slow for it: a test that the linear model fails rejects every network.
+    A pole below ``INTEGRATES`` can be too slow to come to rest in that test, and rests of a high gain lie far off: a
+    test that the linear model fails rejects every network.
     """
-    v, n_y = problem.data.v, problem.data.y.shape[1]
-    return not any(wild(trial.of_fold(fold)[0].model.plant, v, n_y) for fold in trial.folds)
+    n_y = problem.data.y.shape[1]
+    found = [rests_under(trial.of_fold(fold)[0].model.plant, problem) for fold in trial.folds]
+    settles = all(share >= RESTS for _, share in found)
+    largest = max(float(np.abs(x[:, :n_y]).max()) for x, _ in found) if settles else 0.0
+    return replace(problem, settles=settles, farthest=max(problem.farthest, FARTHER * largest))
 
 
 def _slowest(trial: Trial, fold: int) -> float:

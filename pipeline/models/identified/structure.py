@@ -9,6 +9,9 @@ from pipeline.models.identified.dynamics import Stretch
 from pipeline.models.identified.knowledge import NOTHING_KNOWN, Knowledge
 from pipeline.models.identified.scaled_record import Fold, ScaledRecord
 
+FARTHEST = 20.0
+"""Scaled output that no rest of a usable network exceeds, of a plant whose linear model has nearer ones."""
+
 
 @dataclass(frozen=True, slots=True)
 class Structure:
@@ -48,7 +51,8 @@ class Problem:
     """The scaled record of ``n_mv`` MVs, its folds, the seed, and how candidates are judged.
 
     ``judged`` is the correction of the free runs over held-out rows, the same for all candidates. ``settles`` says
-    that the plant comes to rest by itself, as its linear model does; a network that does not is rejected. ``fed_back``
+    that the plant comes to rest by itself, as its linear model does; a network that does not is rejected, and so is one
+    with rests beyond ``farthest``, scaled. ``fed_back``
     says that the MVs follow the outputs. ``known`` is what an engineer knows of pairs of output and input.
     """
 
@@ -58,6 +62,7 @@ class Problem:
     seed: int = 0
     judged: float = 0.0
     settles: bool = False
+    farthest: float = FARTHEST
     fed_back: bool = False
     known: Knowledge = NOTHING_KNOWN
 

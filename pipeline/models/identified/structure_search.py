@@ -64,4 +64,6 @@ class StructureSearch(Groundwork[Searched]):
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
         selection = select(rounds, orders=orders, units=self.units, correction=self.correction, lagged=self.lagged)
-        return Searched(replace(problem, settles=selection.settles), selection, scales, beside)
+        return Searched(
+            replace(problem, settles=selection.settles, farthest=selection.farthest), selection, scales, beside
+        )

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import dataclass, replace
+from typing import Any
 
+import numpy as np
+import pytest
+
+from pipeline.models.identified.candidates import wild
 from pipeline.models.identified.dynamics import Dynamics
 from pipeline.models.identified.linear_search import smallest_first
 from pipeline.models.identified.linear_start import dead_times
 from pipeline.models.identified.network_search import _offers
+from pipeline.models.identified.noise_search import NoiseSearch
 from pipeline.models.identified.output_error import Fitted
+from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.scaled_record import Fold
-from pipeline.models.identified.selection import _settles, _settling_first
-from pipeline.models.identified.structure import Problem, Structure
+from pipeline.models.identified.selection import _as_its_linear_model, _settling_first, by_innovations
+from pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure
 from pipeline.models.identified.trial import Trial
 
 STRUCTURE = Structure("balanced", 1, (0, 0), (0,))
@@ -72,10 +79,50 @@ def test_a_state_that_drifts_is_a_loads_where_a_model_that_settles_errs_as_littl
     assert _settling_first(two_folds(), [first, hardly, clearly])[0] is clearly
 
 
+@dataclass
+class Found:
+    """A search among models with their noise that is over."""
+
+    rounds: Any
+    ranked: list[Trial]
+    network: Trial
+
+    def linear(self, orders: Any) -> list[Trial]:
+        return self.ranked
+
+    def networks(self, linear: Any, units: Any) -> list[Trial]:
+        return [self.network]
+
+
+@pytest.mark.parametrize(("error", "wins"), [(1.0, False), (0.99, True)])
+def test_a_network_gains_nothing_by_what_the_linear_model_gave_away_to_settle(
+    error: float, wins: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The model that settles is 4 nats worse than the one that integrates; a network as good as that one is no gain."""
+    ranked = [trial(1.0, 1.0, 0.9995), trial(1.002, 0.9, 0.9)]
+    network = Trial(replace(STRUCTURE, n_hidden=4), trial(error, 0.9, 0.9).fits)
+    monkeypatch.setattr(NoiseSearch, "of", lambda rounds: Found(rounds, ranked, network))
+    found = by_innovations(Rounds(two_folds(), Budget(1.0, 2_000, 1), ""), (1,), (4,))
+    assert found.linear is ranked[1]
+    assert found.nonlinear is wins
+
+
 def test_a_plant_settles_where_its_linear_model_passes_the_test_of_networks() -> None:
     """A slow pole that is no integrator's fails it, and would reject every network; each fold counts."""
     for poles, settles in (((0.9, 0.95), True), ((0.9987, 0.9), False), ((0.9, 0.9987), False), ((0.9, 1.0), False)):
-        assert _settles(two_folds(), trial(1.0, *poles)) is settles
+        assert _as_its_linear_model(two_folds(), trial(1.0, *poles)).settles is settles
+
+
+def test_a_plant_of_a_high_gain_settles_and_its_networks_may_rest_as_far_off() -> None:
+    """The largest input is .5, so that a pole at .99 rests at 50, where rests beyond 20 counted as wild."""
+    problem, linear = two_folds(), trial(1.0, 0.99, 0.99)
+    found = _as_its_linear_model(problem, linear)
+    model = linear.of_fold(0)[0].model.plant
+    assert found.settles
+    assert found.farthest == pytest.approx(100.0, rel=1e-3)
+    assert wild(model, problem)
+    assert not wild(model, found)
+    assert _as_its_linear_model(problem, trial(1.0, 0.9, 0.9)).farthest == FARTHEST
 
 
 def test_networks_on_the_smallest_candidate_come_before_others_that_cost_more() -> None:
