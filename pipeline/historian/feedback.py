@@ -22,6 +22,7 @@ LATER = (5, 30)  # rows after a move over which the plant's answer is told from 
 CERTAIN = 2.0  # standard deviations of that answer
 INTEGRAL = 0.7  # weight of u's past in u(k), of which an integral has 1
 CLIPPED = 5.0  # typical moves beyond which a move counts as this one: set points and hands move by far more
+STANDS, LEAST_MOVING = 20, 0.1  # rows of one value of an MV that stands; share of the rows in which it has to move
 FED_BACK = 0.1  # share of the clipped moves that the PVs' past explains
 
 
@@ -40,11 +41,15 @@ def fed_back(u: Array, y: Array, run: Runs) -> bool:
     """Whether any MV of u (n, n_mv) follows any PV of y (n, n_pv) in the rows in which neither is moved by hand.
 
     As ``follows``, of moves within ``CLIPPED`` typical ones: a step of a set point is rare and large, and hides what
-    the controller does in all other rows. An MV that mostly stands still follows nothing.
+    the controller does in all other rows. Rows in which the MV stands are those of a hand, or of a step test, and say
+    nothing of a controller in the others; an MV that stands in nearly all of them follows nothing.
     """
     for column in u.T:
+        moving = np.where(_stands(column, run), np.nan, column)
         for pv in y.T:
-            own, seen, part = _read(column, pv, run)
+            own, seen, part = _read(moving, pv, run)
+            if len(own) < LEAST_MOVING * len(column):
+                continue
             move = np.diff(own, prepend=own[:1])
             if not len(own) or (typical := float(np.median(np.abs(move)))) <= 1e-9 * float(np.ptp(own)):
                 continue
@@ -53,6 +58,13 @@ def fed_back(u: Array, y: Array, run: Runs) -> bool:
             if earlier > FED_BACK or (with_row > FED_BACK and _opposes(own, seen, part)):
                 return True
     return False
+
+
+def _stands(u: Array, run: Runs) -> NDArray[np.bool_]:
+    """Rows (n,) of an MV u (n,) that keeps its value for ``STANDS`` rows or more."""
+    changes = np.r_[True, (np.diff(u) != 0) | (np.diff(run) != 0)]
+    piece = np.cumsum(changes) - 1
+    return np.asarray(np.bincount(piece)[piece] >= STANDS)
 
 
 def _read(u: Array, y: Array, run: Runs) -> tuple[Array, Array, Runs]:

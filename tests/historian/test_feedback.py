@@ -56,6 +56,18 @@ def test_a_controller_alone_explains_all_its_moves() -> None:
     assert back
 
 
+@pytest.mark.parametrize("held", [30, 80])
+def test_a_step_test_after_the_record_does_not_hide_its_controller(held: int) -> None:
+    """In more than half of the rows the MV stands then; the controller of the others was taken for a hand."""
+    y, u, _ = OperatedLoop(2.0, dead=3, kc=0.5, ti=10.0).rows(2_000, 1)
+    by_hand = OperatedLoop(2.0, dead=3, kc=0.0, ti=10.0, dither=20.0, dither_rows=held)
+    y_test, u_test, _ = by_hand.rows(2_600, 2)
+    run = np.repeat([0, 1], [len(u), len(u_test)])
+    both, seen = np.r_[u, u_test], np.r_[y, y_test]
+    assert fed_back(both[:, None], seen[:, None], run)
+    assert not fed_back(u_test[:, None], y_test[:, None], run[len(u) :])
+
+
 @pytest.mark.parametrize("lost", [(0, 40), (700, 300), (2_300, 100), (0, 2_400)])
 def test_rows_without_a_reading_end_a_run(lost: tuple[int, int]) -> None:
     """As in a file before it is cleaned: the command then ended in a solver's words."""
