@@ -17,7 +17,7 @@ BLOCKS = {"thiosulfate_cstr": 10}
 # Of what differs from the run before, but for the drift: set points and noise. The first is also looked at without it.
 SEEDS: dict[str, tuple[int, ...]] = {"ph_neutralization_15s": (8, 9, 10, 11)}
 # Parameter, share, the verdicts that tell it, periods within which one does. With other buffer flows both loops of pH
-# miss their set points and move their MV more, and both charts see it in the same blocks: the noise says which is first.
+# miss their set points and move their MV more, and both charts see it in the same blocks: the noise says which first.
 DRIFTS = {
     "thiosulfate_cstr": ("k0", -0.2, ("T_j at rest",), 1_000),
     "ph_neutralization": ("q1", 0.2, ("error of pH", "q3 moves"), 200),
