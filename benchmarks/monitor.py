@@ -212,17 +212,16 @@ def learnt(name: str, seed: int, size: float = 1.0, speed: float = 1.0) -> Watch
     return watched
 
 
-def drifted(watched: Watched, drift: tuple[str, float], most: int, seed: int) -> tuple[int, str, str, str] | None:
-    """The first alarm of a copy of ``watched`` with a drift from now on, its period counted from there."""
+def drifted(watched: Watched, drift: tuple[str, float], most: int, seed: int) -> list[tuple[int, str, str, str]]:
+    """The alarms of the first look that has one, of a copy of ``watched`` with a drift from now on."""
     other = copy.deepcopy(watched)
     other.operation.drift, other.operation.rng = drift, np.random.default_rng(seed)
     other.operation.set_parameters()
-    began = other.operation.k
+    began, before = other.operation.k, len(other.alarms)
     for _ in range(most):
         if other.scan():
-            k, *rest = other.alarms[-1]
-            return (k - began, *rest)
-    return None
+            return [(k - began, *rest) for k, *rest in other.alarms[before:]]
+    return []
 
 
 def effect(law: Law, drift: tuple[str, float], periods: int, seed: int) -> str:
@@ -265,10 +264,11 @@ def main() -> None:
               f"{len(watched.alarms)} alarms till then", flush=True)  # fmt: skip
         most = min(int(options.patience * 86_400 / period), options.most)
         for i, drift in enumerate((p, s * DRIFT) for p in PLANS[name].drifts for s in (-1, 1)):
-            found = drifted(watched, drift, most, options.seed + 1 + i)
-            if found is None:
+            alarms = drifted(watched, drift, most, options.seed + 1 + i)
+            if not alarms:
                 words = f"not found in {most} periods; it changes {effect(watched.operation.law, drift, 4_000, 1)}"
             else:
+                found = alarms[-1]
                 words = f"{found[0]} periods ({found[0] * period / 3600:.2f} h): {found[1]}: {found[2]}: {found[3]}"
             print(f"  {drift[0]} {drift[1]:+.0%}: {words}", flush=True)
         quiet(watched, options.weeks)

@@ -16,11 +16,11 @@ from serving.monitor import monitor, pace
 BLOCKS = {"thiosulfate_cstr": 10}
 # Of what differs from the run before, but for the drift: set points and noise. The first is also looked at without it.
 SEEDS: dict[str, tuple[int, ...]] = {"ph_neutralization_15s": (8, 9, 10, 11)}
-# Parameter, share, the verdicts that tell it, periods within which one does. With other buffer flows both loops of pH
-# miss their set points and move their MV more, and both charts see it in the same blocks: the noise says which first.
+# Parameter, share, the verdicts that tell it, periods within which one does. With less buffer the loop of 15 s
+# misses its set points and moves its MV more, and both charts see it in the same blocks: the noise says which is first.
 DRIFTS = {
     "thiosulfate_cstr": ("k0", -0.2, ("T_j at rest",), 1_000),
-    "ph_neutralization": ("q1", 0.2, ("error of pH", "q3 moves"), 200),
+    "ph_neutralization": ("q1", 0.2, ("q3 moves",), 200),
     "ph_neutralization_15s": ("q1", -0.2, ("error of pH", "q3 moves"), 500),
     "henson_seborg_cstr": ("K1", -0.2, ("q_c at rest",), 500),
     "reversible_cstr": ("k1", -0.2, ("F at rest",), 1_000),
@@ -45,6 +45,6 @@ def assert_found_and_quiet_without(name: str, monkeypatch: pytest.MonkeyPatch) -
     seeds = SEEDS.get(name, (8,))
     for seed in seeds:
         found = benchmark_script("monitor").drifted(watched, (parameter, share), within, seed=seed)
-        assert found is not None, f"seed {seed}: not within {within} periods"
-        assert found[1] in verdicts, found
-    assert benchmark_script("monitor").drifted(watched, (parameter, 0.0), within, seed=seeds[0]) is None
+        assert found, f"seed {seed}: not within {within} periods"
+        assert {name for _, name, *_ in found} & set(verdicts), found
+    assert benchmark_script("monitor").drifted(watched, (parameter, 0.0), within, seed=seeds[0]) == []

@@ -138,7 +138,7 @@ def main(argv: list[str]) -> int:
     options.rows = options.rows or ROWS
     if options.run:
         for name in options.plants or plants:
-            print(run_row(plants[name](), options.rows)[0], flush=True)
+            print(run_row(plants[name](), options.rows), flush=True)
         return 0
     print(HEAD)
     found = []

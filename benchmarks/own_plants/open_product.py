@@ -8,7 +8,7 @@ from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
-from closed_product import Columns, Delivered, by_run, withheld
+from closed_product import Columns, by_run, withheld
 from closed_record import START
 from loops import closed, scores, tests_of
 from plant import OwnPlant
@@ -40,8 +40,8 @@ def write_rows(plant: OwnPlant, rows: int, file: Path) -> None:
             table.writerow([f"{stamp:%Y-%m-%d %H:%M:%S}", *(f"{v:.6g}" for v in row)])
 
 
-def run_row(plant: OwnPlant, rows: int) -> tuple[str, Delivered]:
-    """(a row of text, what came): set points of each shipped file over the NMPC, its loads, or why nothing came."""
+def run_row(plant: OwnPlant, rows: int) -> str:
+    """A row of text: set points of each shipped file over the NMPC, its loads and upsets, or why nothing came."""
     began = time.monotonic()
     file = FOLDER / "exports" / f"{plant.name}-{rows}" / f"{plant.name}.csv"
     write_rows(plant, rows, file)
@@ -60,4 +60,4 @@ def run_row(plant: OwnPlant, rows: int) -> tuple[str, Delivered]:
     parts += [f"withheld {line[:200]}" for line in withheld(project, plant.name)]
     if not done.laws:
         parts += [f"nothing: {line}" for line in done.said[-3:]]
-    return " | ".join([*parts, f"{minutes:.1f} min, {done.seconds / 60:.1f} of a core"]), done
+    return " | ".join([*parts, f"{minutes:.1f} min, {done.seconds / 60:.1f} of a core"])
