@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,12 +19,13 @@ from pipeline.export.operators import check_operators
 from pipeline.files import draft_of
 from pipeline.laws.base import ControlLaw
 from pipeline.plants.simulator import Array
-from serving.controller import Controller, Step
+from serving.controller import Controller
 from serving.errors import LoopwrightError
-from serving.manifest import SENSITIVE, Manifest, Signal
+from serving.manifest import INPUTS, SENSITIVE, Manifest, Signal
 
 GATE_STEPS = 1_000
 GATE_TOLERANCE = 1e-9
+TOGETHER = 200  # steps of a law side by side: more would leave the caches
 INFO_TOLERANCE = 1e-6
 """Of info. It is shown and never fed back, so a difference cannot grow; but entries such as tau_i = Kp/Ki are
 ratios of small differences, which carry the rounding of their terms a thousand times enlarged. One part in a
@@ -118,50 +119,33 @@ def parity_gate(
     """The law and its controller over a closed loop, each step from the same state.
 
     So a wrong graph is told from a loop that amplifies rounding: that is a property of the law, which every host of the
-    file shares. A second run of the controller goes on from its own state, and tells after how many steps such a loop
-    parts. With ``drive`` the process variables are the plant's under the controller's MV; without, they walk at random.
+    file shares. A second run of the controller rounds as the law does in torch, goes on from its own state, and tells
+    after how many steps such a loop parts. With ``drive`` the process variables are the plant's under the controller's
+    MV; without, they walk at random.
 
     ``steps`` are GATE_STEPS unless given. Differences are relative to each entry's largest value over the loop; 1e-13
     of the largest number anywhere is allowed beside it, because an output that ought to be zero is rounding alone. For
     MV and state "anywhere" means among themselves: a large entry of info excuses nothing there.
 
+    The law's steps from the visited states are independent of each other, so that they are computed side by side; where
+    these differ, or the law takes single vectors alone, they are computed one by one, which decides.
+
     Raises ExportError where a step differs by more than 1e-9, where an entry of info differs by more than 1e-6 of its
     largest value, and where either side has no number to give.
     """
     steps = GATE_STEPS if steps is None else steps
-    signals, rng = law.signals, np.random.default_rng(0)
-    courses = (_course(signals.sp, rng, 1 / 40), _course(signals.pv, rng), _course(signals.dv, rng))
-    applied = own_applied = np.array([s.middle for s in signals.mv])
-    state = own_state = np.zeros(law.n_state)
-    pairs, alone = [], list[Array]()
-    show = progress.steps("the exported file beside the law, step by step", steps)
-    for k in range(steps):
-        sp, pv, dv = (step() for step in courses)
-        if drive is not None:
-            pv = np.asarray(drive(applied), dtype=np.float64)
-        with torch.inference_mode():
-            ours = tuple(o.numpy() for o in law(*(torch.from_numpy(v) for v in (sp, pv, dv, applied, state))))
-        try:
-            theirs = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=applied, state=state)
-        except LoopwrightError as error:
-            raise ExportError(f"law {law.name!r} fails at step {k} of the parity loop: {error}") from error
-        pairs.append((np.concatenate(ours), np.concatenate(theirs)))
-        if len(alone) == k:
-            own = _alone(controller, {"sp": sp, "pv": pv, "dv": dv, "mv_applied": own_applied, "state": own_state})
-            if own is not None:
-                alone.append(np.concatenate(own[:2]))
-                own_state, own_applied = own[1], own[0] if drive is None else theirs[0]
-        state, applied = ours[1], ours[0] if drive is None else theirs[0]
-        show(k + 1)
-    torch_side, onnx_side = (np.array(side) for side in zip(*pairs, strict=True))
-    scale = np.maximum(np.abs(torch_side), np.abs(onnx_side)).max(axis=0)
-    names = [*(s.name for s in signals.mv), *(f"state[{i}]" for i in range(law.n_state)), *law.info]
-    n_fed = len(names) - len(law.info)  # MV and state: what is fed back
-    fed = np.arange(len(names)) < n_fed
-    slack = 1e-13 * np.where(fed, scale[:n_fed].max(), scale.max())
+    given, onnx_side = _visited(law, controller, steps, drive)
+    n_fed = len(law.signals.mv) + law.n_state  # MV and state: what is fed back
+    fed = np.arange(n_fed + len(law.info)) < n_fed
     allowed = np.where(fed, GATE_TOLERANCE, INFO_TOLERANCE)
-    relative = _apart(torch_side, onnx_side, scale, slack)
-    if not (relative <= allowed).all():
+    for torch_side in _of_law(law, given):
+        scale = np.maximum(np.abs(torch_side), np.abs(onnx_side)).max(axis=0)
+        slack = 1e-13 * np.where(fed, scale[:n_fed].max(), scale.max())
+        relative = _apart(torch_side, onnx_side, scale, slack)
+        if (relative <= allowed).all():
+            break
+    else:
+        names = [*(s.name for s in law.signals.mv), *(f"state[{i}]" for i in range(law.n_state)), *law.info]
         k = int(np.argmax(~(relative <= allowed).all(axis=1)))
         i = int(np.argmax(relative[k] / allowed))
         raise ExportError(
@@ -171,20 +155,74 @@ def parity_gate(
             "law; in a law of your own use float64 buffers for all constants, and no transposed constant in front of a "
             "vector product"
         )
-    worst = float(relative[:, :n_fed].max())
-    run = np.array(alone)
-    beyond = ~(_apart(torch_side[: len(run), :n_fed], run, scale[:n_fed], slack[:n_fed]) <= GATE_TOLERANCE).all(axis=1)
-    if beyond.any():
-        return Parity(worst, int(beyond.argmax()))
-    return Parity(worst, None if len(run) == steps else len(run))
+    run = _parted(controller, given, (torch_side - onnx_side)[:, :n_fed], with_drive=drive is not None)
+    known = onnx_side[: len(run), :n_fed]
+    beyond = ~(_apart(known, run, scale[:n_fed], slack[:n_fed]) <= GATE_TOLERANCE).all(axis=1)
+    parts_after = int(beyond.argmax()) if beyond.any() else None if len(run) == steps else len(run)
+    return Parity(float(relative[:, :n_fed].max()), parts_after)
 
 
-def _alone(controller: Controller, inputs: Mapping[str, Array]) -> Step | None:
-    """A step of the run that goes on from its own state; None where it has no number to give."""
-    try:
-        return controller.step(**inputs)
-    except LoopwrightError:
-        return None
+def _visited(
+    law: ControlLaw, controller: Controller, steps: int, drive: Callable[[Array], Array] | None
+) -> tuple[dict[str, Array], Array]:
+    """What each step of the controller's loop is given, (steps, n) each, and what it answers (steps, m)."""
+    signals, rng = law.signals, np.random.default_rng(0)
+    courses = {"sp": _course(signals.sp, rng, 1 / 40), "pv": _course(signals.pv, rng), "dv": _course(signals.dv, rng)}
+    applied, state = np.array([s.middle for s in signals.mv]), np.zeros(law.n_state)
+    given, answers = [], list[Array]()
+    show = progress.steps("the exported file beside the law, step by step", steps)
+    for k in range(steps):
+        now = {name: course() for name, course in courses.items()} | {"mv_applied": applied, "state": state}
+        if drive is not None:
+            now["pv"] = np.asarray(drive(applied), dtype=np.float64)
+        try:
+            step = controller.step(**now)
+        except LoopwrightError as error:
+            raise ExportError(f"law {law.name!r} fails at step {k} of the parity loop: {error}") from error
+        given.append(now)
+        answers.append(np.concatenate(step))
+        applied, state = step.mv, step.state
+        show(k + 1)
+    return {name: np.array([now[name] for now in given]) for name in given[0]}, np.array(answers)
+
+
+def _of_law(law: ControlLaw, given: Mapping[str, Array]) -> Iterator[Array]:
+    """The law's answers (steps, m) to what the controller was given: side by side, then one by one."""
+    inputs = [torch.from_numpy(given[name]) for name in INPUTS]
+    n = len(inputs[0])
+    for size in (TOGETHER, 0):
+        rows = [slice(k, k + size) for k in range(0, n, size)] if size else range(n)
+        try:
+            with torch.inference_mode():
+                found = [torch.cat(law(*(v[k] for v in inputs)), dim=-1) for k in rows]
+        except (RuntimeError, IndexError, ValueError):
+            if size:
+                continue
+            raise
+        answers = np.concatenate(found) if size else np.stack(found)
+        if len(answers) == n:
+            yield answers
+
+
+def _parted(controller: Controller, given: Mapping[str, Array], rounding: Array, *, with_drive: bool) -> Array:
+    """MV and state (n, m) of a run that goes on from its own state, as on a host that rounds as torch does.
+
+    To each of its steps the ``rounding`` (steps, m) is added by which torch differs there. It ends where it has no
+    number to give. ``with_drive`` it is given the MV of the first run, whose plant's outputs it sees.
+    """
+    n_mv, run = given["mv_applied"].shape[1], list[Array]()
+    for k, missed in enumerate(rounding):
+        now = {name: of[k] for name, of in given.items()}
+        if run:
+            now["state"] = run[-1][n_mv:]
+            if not with_drive:
+                now["mv_applied"] = run[-1][:n_mv]
+        try:
+            step = controller.step(**now)
+        except LoopwrightError:
+            break
+        run.append(np.concatenate(step[:2]) + missed)
+    return np.array(run).reshape(-1, rounding.shape[1])
 
 
 def _apart(one: Array, other: Array, scale: Array, slack: Array) -> Array:
