@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pipeline.cases.reach import SCALES, TIMES, Reach, held_at
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.simulation.rests import courses
@@ -13,7 +15,7 @@ ROOM = 0.05  # of an MV's range, at each end: what holding a disturbance leaves 
 
 
 def load_size(reach: Reach, cv: int) -> float:
-    """What a load changes of a CV [its unit] within a hold, if no controller acts.
+    """What a load changes of a CV [its unit] at most within a hold, if no controller acts.
 
     ``LOAD`` of the record's standard deviations; on a quiet record with much noise ``ABOVE_NOISE`` of the noise's,
     because a smaller one is lost in it.
@@ -22,14 +24,17 @@ def load_size(reach: Reach, cv: int) -> float:
 
 
 def whole_load(reach: Reach, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float:
-    """The load [CV a period] that moves a CV of a plant by ``load_size``.
+    """The load [CV a period] that moves a CV of a plant by ``load_size`` at most.
 
     An integrating CV moves as far in a third of a hold: there a load is a rate, and three times that is no rest.
+    The largest change counts and not the last: a model's answer to a load may swing far out and come back.
     """
     (x, mv), name, size = plant.start, f"load_{plant.pv_signals[cv].name}", load_size(reach, cv)
     samples, tried = reach.hold // TIMES if cv in reach.integrates else reach.hold, 1e-3 * size
-    ends = [courses(plant, x, mv[None], samples, plant.parameters({name: load}))[0, -1, cv] for load in (tried, 0.0)]
-    return (1 if upwards else -1) * tried * size / abs(float(ends[0] - ends[1]))
+    loaded, free = (
+        courses(plant, x, mv[None], samples, plant.parameters({name: load}))[0, :, cv] for load in (tried, 0.0)
+    )
+    return (1 if upwards else -1) * tried * size / float(np.max(np.abs(loaded - free)))
 
 
 def held_load(reach: Reach, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float | None:

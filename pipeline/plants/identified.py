@@ -13,7 +13,13 @@ from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import AdvanceMany, Array, Simulator
 
 SETTLE = 2000
-"""Periods that the plant is given to come to rest at its start."""
+"""Periods that the plant is given to come to rest at its start; a slower one is brought there by Newton's method."""
+
+STILL = 1e-10
+"""Change of the scaled state in a period that is none."""
+
+NEWTON, SINGULAR, FARTHEST = 12, 1e6, 10.0
+"""Steps; condition of their equations beyond which a plant integrates; scaled outputs beyond which none is at rest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +37,11 @@ class StateEquation:
         """The next states (..., n_x) of scaled states (..., n_x) under scaled inputs (..., n_v)."""
         z = np.concatenate([x, v], axis=-1)
         return x @ self.a.T + v @ self.b.T + self.c + np.tanh(z @ self.w1.T + self.b1) @ self.w2.T
+
+    def slope(self, x: Array, v: Array) -> Array:
+        """dx+/dx (n_x, n_x) at one state x (n_x,) under v (n_v,)."""
+        t = np.tanh(self.w1 @ np.concatenate([x, v]) + self.b1)
+        return self.a + (self.w2 * (1 - t * t)) @ self.w1[:, : len(self.a)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,9 +129,23 @@ class IdentifiedPlant(Simulator):
             before, x = x, self.arrays.advance(x, self._v0)
             if not np.all(np.abs(x) < 1e3):
                 break
-            if np.max(np.abs(x - before)) < 1e-10:
+            if np.max(np.abs(x - before)) < STILL:
                 return x
-        return np.concatenate([seen, start[len(seen) :]])
+        found = self._rest_near(x)
+        return np.concatenate([seen, start[len(seen) :]]) if found is None else found
+
+    def _rest_near(self, x: Array) -> Array | None:
+        """The rest (n_x,) that a slow plant was on its way to; None where it integrates, or would rest far outside."""
+        for _ in range(NEWTON):
+            ahead = self.arrays.advance(x, self._v0)
+            gap = np.eye(len(x)) - self.arrays.slope(x, self._v0)
+            if not np.all(np.isfinite(ahead)) or np.linalg.cond(gap) > SINGULAR:
+                return None
+            if np.max(np.abs(ahead - x)) < STILL:
+                far = np.max(np.abs(x[: len(self.arrays.y_scale)]))
+                return x if far < FARTHEST and np.max(np.abs(np.linalg.eigvals(np.eye(len(x)) - gap))) < 1 else None
+            x = x + np.linalg.solve(gap, ahead - x)
+        return None
 
     # ------------------------------------------------------------------ what a closed loop needs
     @property
