@@ -17,12 +17,18 @@ RISES = (0.1, 0.63)
 GOES_ON = 0.1
 """Share of its last value that an answer gains in its last fifth, from which it goes on; a ramp gains a fifth."""
 
+OFTEN = 0.1
+"""Share of the members whose answers go on, above which all are taken so."""
+
+MIDDLE, ENOUGH = (0.159, 0.841), 8
+"""Quantiles one standard deviation from the median of a normal sample, and members from which they are told."""
+
 MOST_COLOUR = 0.95
 """Of the noise: what is slower is a disturbance."""
 
 
 class Doubt(NamedTuple):
-    """Standard deviations over models that are as likely as the fitted one."""
+    """Standard deviations over models that are as likely as the fitted one, see ``spread``."""
 
     gain: Array  # (n_mv,) relative, of the answer that each MV moves most
     pace: Array  # (1,) relative, of the time constant
@@ -33,7 +39,7 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
     """From the models' scaled step responses (members, n_v, length, n_y), the MVs' first.
 
     Of each MV the output counts that it moves most. Speed and dead time are those of the MV that is least certain,
-    as all inputs of a plant share its dynamics. An answer that goes on is taken over the rows that a predictive
+    as all inputs of a plant share its dynamics. Answers that go on are taken over the rows that a predictive
     law looks ahead at most: a pole near 1 is never certain, and what it makes of hundreds of rows hides how well the
     first ones are known.
     """
@@ -41,17 +47,29 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
     for j in range(n_mv):
         strongest = int(np.abs(np.median(curves[:, j, -1], axis=0)).argmax())
         found = curves[:, j, :, strongest]  # (members, length)
-        usual = np.median(found, axis=0)
-        if abs(usual[-1] - usual[-max(len(usual) // 5, 1)]) > GOES_ON * abs(usual[-1]):
+        late = found[:, -max(found.shape[1] // 5, 1)]
+        if np.mean(np.abs(found[:, -1] - late) > GOES_ON * np.abs(found[:, -1])) > OFTEN:
             found = found[:, :MOST_PERIODS]
         middle = float(np.median(found[:, -1]))
         if len(found) < 2 or middle == 0.0:
             continue
-        gain[j] = found[:, -1].std(ddof=1) / abs(middle)
+        gain[j] = spread(found[:, -1]) / abs(middle)
         rises = np.array([[reached(one / one[-1] if one[-1] else one, share) for share in RISES] for one in found])
         taken = rises[:, 1] - rises[:, 0]
-        pace[j], dead[j] = taken.std(ddof=1) / max(float(np.median(taken)), 1.0), rises[:, 0].std(ddof=1)
+        pace[j], dead[j] = spread(taken) / max(float(np.median(taken)), 1.0), spread(rises[:, 0])
     return Doubt(gain, np.array([pace.max()]), np.array([dead.max()]))
+
+
+def spread(values: Array) -> float:
+    """Standard deviation of values (n,), or half of the middle 68 % where that is less.
+
+    A few members far from all others say little: a drawn pole beyond 1 alone makes a gain of any size.
+    """
+    whole = float(values.std(ddof=1))
+    if len(values) < ENOUGH:
+        return whole
+    low, high = np.quantile(values, MIDDLE)
+    return min(whole, 0.5 * float(high - low))
 
 
 def colour_of(residuals: Sequence[Array]) -> Array:
