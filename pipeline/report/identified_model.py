@@ -119,6 +119,7 @@ def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, 
 
 def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
     plant, gains = evidence.case.plant_class, part.get("gains") or {}
+    bent = (part.get("structure") or {}).get("hidden", 1) > 0
     rows = []
     for signal in plant.sp_signals:
         for given in (*plant.mv_signals, *plant.dv_signals):
@@ -129,6 +130,7 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
             dead = (part.get("dead_times") or {}).get(given.name)
             first = answers_after(curve, dead or 0.0) if curve else None if dead is None else dead + 1.0
             varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
+            over = f"{number(found['low'])} … {number(found['high'])}, {varies}"
             rows.append(
                 (
                     signal.name,
@@ -138,7 +140,7 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
                         gain_unit(signal, given, bool(found.get("rate"))),
                     ),
                     SIGNS.get(found["sign"], found["sign"]),
-                    f"{number(found['low'])} … {number(found['high'])}, {varies}",
+                    over if bent else "one gain: the model is linear",
                     "–" if not first else number(first * plant.period_s),
                 )
             )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.metrics import fit_percent
 from pipeline.models.identified.assembly import dead_periods, step_responses
+from pipeline.models.identified.doubt import spread
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.innovations import AHEAD, Innovations, ahead
 from pipeline.models.identified.output_error import fit_starts
@@ -44,6 +45,11 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
     s = chosen.structure
     if network is None:
         words = "linear is enough: its residual is as small as the noise, or no network could be trained"
+    elif selection.innovations is not None and not selection.nonlinear:
+        words = (
+            "linear: one row ahead no network is better by enough to count; a record in closed loop often does not "
+            "tell whether gains change over the range"
+        )
     elif selection.nonlinear:
         words = f"nonlinear by a factor of {selection.factor:.3g} in the held-out free run"
     else:
@@ -171,7 +177,8 @@ def gain_figures(
 
     ``gain`` is taken where all inputs are at the medians of the data; where ``rate`` is true it is in PV/input a
     period. ``sign`` is uncertain where the gain lies within ``SURE`` spreads of zero; ``varies`` is the ratio of the
-    largest to the smallest local gain, None where the gain changes its sign.
+    largest to the smallest local gain, None where the gain changes its sign. Members that settle and members that do
+    not have figures of two units: those count that are the more.
     """
     found = [gains(m, data) for m in members]
     local, rates = (np.array([of[k] for of in found]) for k in (0, 1))  # (members, n_v, quantiles, n_y)
@@ -180,16 +187,18 @@ def gain_figures(
         table[pv.name] = {}
         for j, signal in enumerate(inputs):
             unit = scales.y_scale[i] / scales.v_scale[j]
-            of = local[:, j, :, i] * unit
+            moving = rates[:, j, len(QUANTILES) // 2, i]
+            rate = bool(2 * np.count_nonzero(moving) > len(members))
+            of = local[moving == rate, j, :, i] * unit
             middle = of[:, len(QUANTILES) // 2]
-            gain, spread = float(np.median(middle)), float(middle.std(ddof=1)) if len(middle) > 1 else 0.0
+            gain, sd = float(np.median(middle)), spread(middle) if len(middle) > 1 else 0.0
             over = np.median(of, axis=0)
             turns = bool(over.min() < 0 < over.max())
             table[pv.name][signal.name] = {
                 "gain": gain,
-                "spread": spread,
-                "rate": bool(2 * np.count_nonzero(rates[:, j, len(QUANTILES) // 2, i]) > len(members)),
-                "sign": "uncertain" if abs(gain) <= SURE * spread else "+" if gain > 0 else "-",
+                "spread": sd,
+                "rate": rate,
+                "sign": "uncertain" if abs(gain) <= SURE * sd else "+" if gain > 0 else "-",
                 "low": float(over.min()),
                 "high": float(over.max()),
                 "varies": None if turns else float(np.abs(over).max() / max(np.abs(over).min(), 1e-12)),
