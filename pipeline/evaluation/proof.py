@@ -17,7 +17,6 @@ LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
 BY_REGION = ("turns", "fades")  # verdicts on answers that hold by the regions of the MV's range
 FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
 LITTLE = "the record leaves its sign open; beside the other answers it decides nothing, and all loops stand either"
-ONE_SIDE = "controllers stay on one side of the turn; their files state the range"
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
     "`loopwright new` lists them in step_test.csv, and give these rows too"
@@ -142,8 +141,6 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
         holds = little or _holds(found, known, shown=foreseen)
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
         because = LITTLE if little else _word(found, known, holds=holds) or _why(pv, mv, found)
-    if holds and _turns(found) and len(proof["answers"][pv]) == 1:
-        because = "; ".join(filter(None, (because, ONE_SIDE)))
     return Statement(
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         limit,
@@ -151,12 +148,6 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
         holds,
         because,
     )
-
-
-def _turns(found: Mapping[str, Any]) -> bool:
-    """Whether the record proves gains of both signs, each in regions of its own."""
-    proven = [r["model"] > 0 for r in found.get("regions") or () if not r["small"] and r["verdict"] == "proven"]
-    return len(set(proven)) > 1
 
 
 def _matters_little(pv: str, found: Mapping[str, Any], proof: Mapping[str, Any], *, shown: bool) -> bool:

@@ -51,7 +51,8 @@ def model_section(evidence: Evidence) -> ModelSection | None:
     if not part:
         return None
     mvs = [s.name for s in evidence.case.plant_class.mv_signals]
-    sentences = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs), *_asked(evidence))
+    verdicts = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs))
+    sentences = (*verdicts, *_asked(evidence), *_one_side(evidence))
     judged = str((part.get("structure") or {}).get("judged") or "free run")
     return ModelSection(sentences, _variables(evidence, part), _answers(evidence, part), _tried(part), judged)
 
@@ -75,6 +76,18 @@ def _asked(evidence: Evidence) -> tuple[str, ...]:
     ends = zip(evidence.case.plant_class.sp_signals, asked.min(axis=0), asked.max(axis=0), strict=True)
     ranges = ", ".join(f"{s.name} from {number(low)} to {number(high)} {s.unit}".rstrip(" -") for s, low, high in ends)
     return (f"The tests ask for {ranges}, which the MVs can hold within the record. Nothing is known of others.",)
+
+
+def _one_side(evidence: Evidence) -> tuple[str, ...]:
+    """The MVs that controllers move over a part of their ranges, because the gain turns its sign beyond it."""
+    case = evidence.case
+    pairs = zip(case.plant_class.mv_signals, case.plant.mv_signals, strict=True) if case.on_models else ()
+    return tuple(
+        f"Controllers move {own.name} from {number(own.low)} to {number(own.high)} {own.unit}".rstrip(" -")
+        + " alone: beyond that the record proves a gain of the other sign, and a loop there would lock up."
+        for whole, own in pairs
+        if (whole.low, whole.high) != (own.low, own.high)
+    )
 
 
 def _left_open(part: Mapping[str, Any], mvs: Sequence[str]) -> tuple[str, ...]:
