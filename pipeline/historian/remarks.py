@@ -27,8 +27,8 @@ ELSEWHERE = 0.1  # readings of other files for each row of the file that lacks t
 AHEAD = 25.0  # strength of moves still to come
 
 
-def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
-    """Compression, exception reporting, repeated values and coarse steps of one tag."""
+def of_series(series: Series, rate: Sampling, role: str, period_s: float) -> list[Finding]:
+    """Compression, exception reporting, repeated values and coarse steps of one tag; ``period_s`` of the record."""
     if series.categories:
         return []
     found = []
@@ -53,10 +53,9 @@ def of_series(series: Series, rate: Sampling, role: str) -> list[Finding]:
         )
         found.append(Finding("compression", series.tag, words))
     if (length := staircase(values)) > 1 and role == "pv":
-        words = (
-            f"every value stands {length} times: made once in {length * rate.step_s:.4g} s (a mean, or held), written "
-            f"more often; give --period {length * rate.step_s:.6g}"
-        )
+        made_s = length * rate.step_s
+        words = f"every value stands {length} times: made once in {made_s:.4g} s (a mean, or held), written more often"
+        words += f"; give --period {made_s:.6g}" if period_s < 0.99 * made_s else f"; the rows are of {period_s:.6g} s"
         found.append(Finding("repeated", series.tag, words))
     step = quantum(values)
     if span > 0 and step > COARSE * span and role in {"pv", "dv"}:  # an MV is moved in steps

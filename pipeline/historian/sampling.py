@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import RecordError
-from pipeline.historian.character import quantum
+from pipeline.historian.character import quantum, staircase
 from pipeline.historian.clock import exact_step, keeps_time
 from pipeline.historian.export import Series
 from pipeline.historian.reason import Reason
@@ -86,7 +86,8 @@ def proposed_period(series: Sequence[Series], others: Sequence[Series] = ()) -> 
 
     The median step of a PV that keeps none; of one that is drawn on lines, a part of it, a multiple of the scan: that
     of its stamps, or the step of ``others`` that keep time. A swinging door stores nothing for long where the PV goes
-    straight, and says all the same where it was.
+    straight, and says all the same where it was. Where every value of each PV stands for some readings, as that of an
+    analyser does, a period is as long: the readings between say nothing new, and a model of them would hold still.
     """
     regular = [r.step_s for r in map(sampling, others) if r.step_s and not r.irregular]
     stamps = [_stamps(s) for s in series]
@@ -95,7 +96,7 @@ def proposed_period(series: Sequence[Series], others: Sequence[Series] = ()) -> 
     steps = [s for s in steps if s > 0]
     if not steps:
         raise RecordError("no process variable has two readings of different times; export a longer time")
-    return max(steps)
+    return float(f"{max(steps) * min(staircase(s.value[s.good]) for s in series):.12g}")
 
 
 def _step(series: Series, stamps: Array, scan_s: float, exact: dict[int, float | None]) -> float:

@@ -100,7 +100,7 @@ def screened(
     findings += of_period(pace, period, step, given=period_s is not None)
     findings += of_rows(pvs, period, step)
     role_of = {t.tag: t.role for t in tags}
-    findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag])]
+    findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag], period)]
     steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
 
     counts_of: dict[str, dict[str, int]] = {}

@@ -146,7 +146,6 @@ def test_all_faults_at_once(tmp_path: Path) -> None:
         ("MV late by three rows", lambda d: d.with_(mv=np.r_[np.full(5, d.mv[0]), d.mv[:-5]]), "shifted", "TIC-101.OP"),
         ("drift", lambda d: d.with_(pv=d.pv + np.linspace(0, 25, len(d.pv))), "drift", "TIC-101.PV"),
         ("a jump", lambda d: d.with_(pv=d.pv + 5 * (np.arange(len(d.pv)) > 1400)), "drift", "TIC-101.PV"),
-        ("values repeated", lambda d: d.with_(pv=np.repeat(d.pv[::5], 5)), "repeated", "TIC-101.PV"),
         (
             "swinging door", lambda d: d.with_(pv=np.interp(d.time_s, d.time_s[::25], d.pv[::25])),
             "compression", "TIC-101.PV",
@@ -163,6 +162,19 @@ def test_what_is_named_and_kept(
     assert tag in named[0].tag
     assert not named[0].drops
     assert len(found.record) > 2800
+
+
+def test_values_that_stand_give_rows_as_long_unless_a_period_is_given(tmp_path: Path) -> None:
+    """An analyser's value in each of five rows: a model of single rows would hold still, and nothing seem to answer."""
+    data = clean(3000)
+    data = data.with_(pv=np.repeat(data.pv[::5], 5))
+    found, given = screen_of(data, tmp_path), screen_of(data, tmp_path, period_s=PERIOD_S)
+    for screened_one, rows, period_s in ((found, 600, 5 * PERIOD_S), (given, 3000, PERIOD_S)):
+        accounted(screened_one)
+        assert "repeated" in kinds(screened_one)
+        assert screened_one.report.period_s == period_s
+        assert 0.93 * rows < len(screened_one.record) <= rows
+    assert found.report.verdict.carries == "yes", found.report.verdict.reasons
 
 
 def test_a_true_step_and_a_true_peak_are_no_damage(tmp_path: Path) -> None:
