@@ -46,12 +46,13 @@ class StepResponses:
     def near_start(cls, plant: Simulator) -> Self:
         """Central differences of runs with each MV a little above and below, one-sided at the end of a range.
 
+        A model may rest where no MV gets: then the nearest ones are moved.
         They are as long as it takes to settle, or to rise or fall evenly. LawError where a run is not finite.
         """
         x0, mv0 = plant.start
         low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
         span, n_cv = np.diag(STEP * (high - low)), len(plant.sp_signals)
-        ends = [np.clip(mv0 + sign * span, low, high) for sign in (1, -1)]
+        ends = [np.clip(np.clip(mv0, low, high) + sign * span, low, high) for sign in (1, -1)]
         size = np.diag(ends[0] - ends[1])
         mv = np.concatenate(ends)
         x, advance = np.tile(x0, (len(mv), 1)), plant.many(len(mv))
