@@ -101,15 +101,15 @@ def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array 
     measured = iter(test.disturbances(plant))
     n_info = len(controller.manifest.info)
 
-    def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, Array]:
+    def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, tuple[float, ...]]:
         nonlocal state
         dv = next(measured)
         try:
             mv, state, info = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=mv_applied, state=state)
         except LoopwrightError:
             state = controller.cold_state()
-            return mv_applied, np.append(np.zeros(n_info), 1.0)
-        return mv, np.append(info, 0.0)
+            return mv_applied, (*(0.0 for _ in range(n_info)), 1.0)
+        return mv, (*info.tolist(), 0.0)
 
     return simulate_closed(plant, step, test, noise=noise, seed=seed)
 
