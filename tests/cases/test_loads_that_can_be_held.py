@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,10 @@ from own_cases import controllers_of_a_lag
 from pipeline.cases.loads import ABOVE_NOISE, LEAST_LOAD, LOAD, held_load, load_size, whole_load
 from pipeline.cases.own_plant import GATE
 from pipeline.cases.reach import SCALES, Reach, held_at
+from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from pipeline.plants.signals import Signals
+from pipeline.simulation.rests import courses
+from serving.manifest import Signal
 
 
 @pytest.fixture(autouse=True)
@@ -25,6 +31,28 @@ def wanted_load(reach: Reach, monkeypatch: pytest.MonkeyPatch) -> float:
         found = held_load(reach, reach.model, 0)
     assert found is not None
     return found
+
+
+@pytest.mark.parametrize("upwards", [True, False])
+def test_a_load_that_a_model_answers_by_a_swing_is_sized_by_its_largest_effect(upwards: bool) -> None:
+    """Of a bleach plant the model came back to a twentieth: sized by that, its test left the range for any law."""
+    comes_back = np.array([[0.9, -0.1], [0.1, 0.99]])
+    arrays = IdentifiedArrays(
+        comes_back, np.array([[0.1], [0.0]]), np.zeros(2), np.zeros((0, 3)), np.zeros(0), np.zeros((2, 0)),
+        np.array([50.0]), np.array([4.0]), np.array([50.0]), np.array([50.0]), np.zeros((2, 3)),
+    )  # fmt: skip
+    pv, mv = (Signal("T", "degC", 0.0, 100.0),), (Signal("V", "%", 0.0, 100.0),)
+    plant = IdentifiedPlant(Signals(1.0, pv, pv, (), mv), arrays)
+    record = SimpleNamespace(pv=4.0 * np.sin(np.arange(200))[:, None])
+    reach: Any = SimpleNamespace(
+        hold=400, integrates=(), record=record, model=SimpleNamespace(noise_std=np.array([0.1]))
+    )
+    (x, applied), size = plant.start, load_size(reach, 0)
+    load = whole_load(reach, plant, 0, upwards)
+    y = courses(plant, x, applied[None], 400, plant.parameters({"load_T": load}))[0, :, 0] - 50.0
+    assert np.sign(load) == (1 if upwards else -1)
+    assert np.abs(y).max() == pytest.approx(size, rel=1e-6)
+    assert abs(y[-1]) < 0.5 * size
 
 
 def test_a_plant_with_room_has_all_loads_and_its_weights_as_they_are() -> None:

@@ -199,6 +199,20 @@ def test_refused_laws_leave_nothing_behind(
     assert not list(tmp_path.rglob("*.*"))
 
 
+def test_a_law_of_single_vectors_passes_as_one_of_many_does(
+    pi_law: ControlLaw, make_formula: MakeFormula, tmp_path: Path
+) -> None:
+    """A person's own law may sum over all it is given: its steps side by side differ, and one by one they decide."""
+
+    def alone(law: ControlLaw, *inputs: Tensor) -> Any:
+        mv, state, info = pi_law(*inputs)
+        return mv + 0.0 * mv.sum(), state + inputs[1].sum() - inputs[1].sum(dim=-1, keepdim=True), info
+
+    law, file = make_formula(alone, 2, ("error", "move")), tmp_path / "law.onnx"
+    export(law, file, case="none", provenance={})
+    assert parity_gate(law, Controller(file)) == (pytest.approx(0.0, abs=GATE_TOLERANCE), None)
+
+
 def test_gate_tells_a_law_from_another(pi_law: ControlLaw, pi_file: Path, make_formula: MakeFormula) -> None:
     def off(law: ControlLaw, *inputs: Tensor) -> Any:
         mv, state, info = pi_law(*inputs)

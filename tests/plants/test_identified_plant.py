@@ -16,12 +16,14 @@ LEVELS = (Signal("T", "degC", 0.0, 100.0), Signal("L", "m", 0.0, 4.0))
 SIGNALS = Signals(5.0, LEVELS, LEVELS, (Signal("F", "kg/s", 0.0, 2.0),), (Signal("V", "%", 0.0, 100.0),))
 
 
-def made(hidden: bool = True, pole: float = 0.8, most_dead_time: int = 0) -> IdentifiedPlant:
-    w2 = 0.1 * np.array([[1.0], [0.5], [0.0]]) * hidden
+def made(
+    hidden: bool = True, pole: float = 0.8, most_dead_time: int = 0, bend: float = 0.1, push: float = 0.01
+) -> IdentifiedPlant:
+    w2 = bend * np.array([[1.0], [0.5], [0.0]]) * hidden
     arrays = IdentifiedArrays(
         a=np.array([[pole, 0.0, 0.1], [0.0, 0.7, 0.0], [0.0, 0.1, 0.5]]),
         b=np.array([[0.2, 0.0], [0.0, 0.1], [0.3, 0.1]]),
-        c=np.array([0.01, 0.0, -0.02]),
+        c=np.array([push, 0.0, -0.02]),
         w1=np.array([[0.5, 0.0, 0.2, 1.0, 0.0]]),
         b1=np.array([0.1]),
         w2=w2,
@@ -46,6 +48,24 @@ def test_it_starts_at_rest_and_stays_there() -> None:
     x, mv = plant.start
     assert plant.step(x, mv, plant.dv_nominal, plant.parameters()) == pytest.approx(x, abs=1e-9)
     assert mv == pytest.approx([50.0])
+
+
+@pytest.mark.parametrize("pole", [0.95, 0.9914, 0.998, 0.9995])
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_slow_plant_starts_at_rest_too(pole: float, hidden: bool) -> None:
+    """With .9914 a thousandth of the way was left after 2,000 periods, and the start was taken for an integrator's."""
+    plant = made(hidden, pole, bend=0.2 * (1 - pole), push=0.2 * (1 - pole))
+    x, mv = plant.start
+    after = x
+    for _ in range(500):
+        after = plant.step(after, mv, plant.dv_nominal, plant.parameters())
+    assert plant.measure(after) == pytest.approx(plant.measure(x), abs=1e-6)
+
+
+@pytest.mark.parametrize(("pole", "push"), [(1.0, 0.0), (1.002, 0.0), (0.9999, 0.1)])
+def test_what_rests_nowhere_or_far_away_starts_at_the_centre_of_the_outputs(pole: float, push: float) -> None:
+    plant = made(False, pole, push=push)
+    assert plant.measure(plant.start[0]) == pytest.approx([50.0, 2.0])
 
 
 def test_a_gain_turns_about_the_start() -> None:

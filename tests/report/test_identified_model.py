@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -68,6 +69,34 @@ def test_an_answer_says_its_sign_and_how_sure_that_is(section: ModelSection) -> 
     assert "turns its sign" in section.answers[1][4]
     assert [row[2] for row in section.answers] == ["0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V a period]"]
     assert [row[5] for row in section.answers] == ["4", "1", "4"]
+
+
+@pytest.mark.parametrize(("hidden", "over"), [(0, {"one gain: the model is linear"}), (4, {"-0.1 … 0.9, × 1.4"})])
+def test_a_linear_model_says_nothing_of_gains_over_the_range(
+    hidden: int, over: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = {**PART, "structure": {"verdict": "linear", "hidden": hidden}, "gains": {"y0": {"u0": gain("+", 1.4)}}}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    assert {row[4] for row in found.answers} == over
+
+
+@pytest.mark.parametrize(("high", "lines"), [(1.0, 0), (0.4, 1)])
+def test_the_report_says_on_which_side_of_a_turn_controllers_stay(
+    high: float, lines: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    case: Any = two_lags()
+    whole = case.plant_class.mv_signals
+    ends = [replace(s, high=s.low + high * (s.high - s.low)) for s in whole]
+    vars(case.plant)["mv_signals"] = tuple(ends)
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": PART}}}}}
+    found = model_section(SimpleNamespace(case=case, models=models))  # type: ignore[arg-type]
+    assert found is not None
+    told = [line for line in found.verdicts if line.startswith("Controllers move ")]
+    assert len(told) == lines * len(whole)
 
 
 def test_the_best_structures_are_listed_and_the_chosen_one_whatever_its_error(section: ModelSection) -> None:

@@ -90,6 +90,18 @@ def test_a_lag_with_dead_time_is_found(pole: float, gain: float, dead: int) -> N
     assert found.settling == pytest.approx(dead + np.log(0.05) / np.log(pole) + 1, rel=0.05, abs=2)
 
 
+@pytest.mark.parametrize("beyond", [-3.0, 3.0])
+def test_a_plant_that_rests_where_no_mv_gets_is_moved_at_the_nearest(
+    beyond: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A model of a 2x2 whose record left a pole at 1 rested at 106 %, and both ends of its difference were 100 %."""
+    plant = lag(0.9, 0.5, 2)
+    monkeypatch.setattr(Sampled, "start", property(lambda self: (np.zeros(3), np.array([beyond]))))
+    found = StepResponses.near_start(plant)
+    assert found.gain[0, 0] == pytest.approx(0.5, rel=0.02)
+    assert found.answers_after(0, 0) == 3
+
+
 def test_an_integrator_is_a_ramp_with_dead_time() -> None:
     found = StepResponses.near_start(tank())
     assert found.integrates.all()
