@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from _exports import CLEAN, TAGS, Export, experiment
+from _exports import CLEAN, PERIOD_S, TAGS, Export, experiment
 from _spoilt_exports import KINDS, Kind
 
 from pipeline.errors import ModelError, PipelineError
@@ -28,6 +28,7 @@ from pipeline.models.identified.linear_start import Realizations, high_order_arx
 from pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array
 from pipeline.records.record import Record
 
 PAGE = Path("docs") / "damage.md"
@@ -157,12 +158,21 @@ def error_of(record: Record, lower: float = 0.0) -> float:
     best = min(fits, key=lambda f: f.held_out)
     clean = experiment(1)
     signals = Signals(record.period_s, record.pv_signals, record.pv_signals, record.dv_signals, record.mv_signals)
-    test = Record.of(signals, clean.pv[:, None] - lower, clean.mv[:, None], dv=clean.dv[:, None])
+    n = max(1, round(record.period_s / PERIOD_S))
+    # Rows of several readings: the MV from their time on, PV and disturbance up to it, as `loopwright new` takes them.
+    mv = means(clean.mv[n - 1 :], n)
+    pv, dv = (means(values, n)[: len(mv)] for values in (clean.pv, clean.dv))
+    test = Record.of(signals, pv[:, None] - lower, mv[:, None], dv=dv[:, None])
     rows = ScaledRecord.of(test, scales).stretches()
     rest = residuals(best.model, fit_starts(best.model, rows), rows)
     if rest is None:
         raise ModelError("the model explodes on the clean rows")
     return float(rest[0].std() * scales.y_scale[0])
+
+
+def means(values: Array, n: int) -> Array:
+    """The means (m // n,) of each ``n`` of the values (m,)."""
+    return np.asarray(values[: len(values) // n * n].reshape(-1, n).mean(axis=1))
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ from closed_refused import KINDS, MINUTES, refused_main
 from closed_untouched import CLOSED_UNTOUCHED
 from development import DEVELOPMENT
 from further import FURTHER
-from loops import Score, closed, scores, tests_of
+from loops import Score, scored
 from open_product import run_row
 from plant import OwnPlant
 from store import bound_of, model_of
@@ -66,15 +66,6 @@ def pid_of(plant: OwnPlant) -> ControlLaw | None:
     except PipelineError as error:
         print(f"  {plant.name}: no PID: {error}", file=sys.stderr)
         return None
-
-
-def scored(law: ControlLaw, plant: OwnPlant) -> dict[str, Score]:
-    """Of one law, by test."""
-    found = {}
-    for name, tests in tests_of(plant).items():
-        y, u = closed(law, plant, tests)
-        found[name] = scores(plant, tests, y[0], u[0])
-    return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -138,3 +138,12 @@ def scores(plant: OwnPlant, tests: list[LoopTest], y: Array, u: Array) -> Score:
     reach = np.array([s.high - s.low for s in plant.mv_signals])
     travel = np.abs(np.diff(u, axis=1)) / reach
     return Score(*(100 * float(part.mean()) for part in (error, error[:, late], travel)))
+
+
+def scored(law: Steps, plant: OwnPlant) -> dict[str, Score]:
+    """The scores of one law, by test."""
+    found = {}
+    for name, tests in tests_of(plant).items():
+        y, u = closed(law, plant, tests)
+        found[name] = scores(plant, tests, y[0], u[0])
+    return found

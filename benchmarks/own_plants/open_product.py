@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from closed_product import Columns, by_run, withheld
 from closed_record import START
-from loops import closed, scores, tests_of
+from loops import scored
 from plant import OwnPlant
 from record import record_of
 from store import FOLDER, bound_of
@@ -51,10 +51,7 @@ def run_row(plant: OwnPlant, rows: int) -> str:
     bound = bound_of(plant)
     parts = [f"{plant.name:12} NMPC {bound:5.2f}"]
     for name, law in done.laws.items():
-        found = {}
-        for test, tests in tests_of(plant).items():
-            y, u = closed(law, plant, tests)
-            found[test] = scores(plant, tests, y[0], u[0]).nmae
+        found = {test: score.nmae for test, score in scored(law, plant).items()}
         sp = found["set points"]
         parts.append(f"{name} {sp:5.2f} ({sp / bound:.2f}) loads {found['loads']:5.2f} upsets {found['upsets']:5.2f}")
     parts += [f"withheld {line[:200]}" for line in withheld(project, plant.name)]
