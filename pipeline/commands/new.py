@@ -220,11 +220,11 @@ def _write(
     shutil.rmtree(earlier, ignore_errors=True)
     if not unusable:
         shutil.rmtree(WORK / name, ignore_errors=True)  # models of a plant that was replaced need not suit this one
-    tell(name, folder, report, test, added=not unusable, asked=bool(questions))
-    if not (made or report.operated):
+    tell(name, folder, report, test, known, added=not unusable, asked=bool(questions))
+    if not (made or report.old_controllers):
         print("the old controller is not known, as no set point is named: with --sp TAG, and --mode TAG, it stands in "
               "every table")  # fmt: skip
-    if report.operated:
+    if report.old_controllers:
         for line in loop_lines(tags):
             print(plain(f"{line}; is it so? Column loop of the table of tags corrects it"))
     for line in confirmed(found.record.mv_signals, tags, {old.mv for old in report.old_controllers}):

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
+from pipeline.config.known import Known
 from pipeline.historian.excitation import HELD
 from pipeline.historian.findings import InputReport, Screening, Verdict, counted
 from pipeline.historian.pace import in_words
@@ -13,8 +14,20 @@ from pipeline.pictures.drawing import axis_label, ratio_unit
 from serving.words import plain
 
 
-def tell(name: str, folder: Path, report: Screening, test: StepTest | None, *, added: bool, asked: bool) -> None:
-    """Print the rows kept, what was found, the verdict, and where to look next; ``asked``: a question comes first."""
+def tell(
+    name: str,
+    folder: Path,
+    report: Screening,
+    test: StepTest | None,
+    known: Collection[Known] = (),
+    *,
+    added: bool,
+    asked: bool,
+) -> None:
+    """Print the rows kept, what was found, the verdict, and where to look next; ``asked``: a question comes first.
+
+    What an engineer says that he knows is not asked for.
+    """
     print(f"{name}: {report.summary}")
     takes = in_words(3600 * test.hours) if test else ""
     if report.gaps:
@@ -24,7 +37,7 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, *, a
         print(f"  {counted(rows, 'row').rjust(13 - (rows == 1))} dropped: {reason.replace('_', ' ')}")
     for finding in report.findings:
         print(plain(f"  {finding.tag}: {finding.words}"))
-    for line in sayings(report.verdict, {tag.name: tag.unit for tag in report.tags}):
+    for line in sayings(report.verdict, {tag.name: tag.unit for tag in report.tags}, known):
         print(plain(f"  {line}"))
     for loop in report.operated:
         print(plain(f"how it was run: {loop.words}"))
@@ -48,25 +61,25 @@ def tell(name: str, folder: Path, report: Screening, test: StepTest | None, *, a
               f"it moves {sizes}{test.reading}")  # fmt: skip
 
 
-def sayings(verdict: Verdict, units: Mapping[str, str]) -> list[str]:
+def sayings(verdict: Verdict, units: Mapping[str, str], known: Collection[Known] = ()) -> list[str]:
     """Lines on the plant by its data, one a pair, for a person to compare with what is known of it.
 
-    ``units`` are those of the signals by name.
+    ``units`` are those of the signals by name; of the pairs that are ``known`` nothing is asked.
     """
-    lines = []
+    lines, said = [], {(one.pv, one.input): one.says for one in known}
     for i in verdict.inputs:
         for pv, gain in i.gain.items():
             first = i.first_answer_s.get(pv)
             rate = i.rate.get(pv)
             if not gain and first is None and rate is None:
+                open_question = "does it move it on the plant, and which way?"
                 if i.role == "mv":
-                    lines.append(
-                        f"{i.name} -> {pv}: not clear from the record; does it move it on the plant, and which way?"
-                    )
+                    further = f"you say {said[pv, i.name]}" if (pv, i.name) in said else open_question
+                    lines.append(f"{i.name} -> {pv}: not clear from the record; {further}")
                 continue
             # The report has the gain at the middle of the record, by the models that are fitted later.
-            known = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
-            words = [known if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
+            by_one = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
+            words = [by_one if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
             seldom = ", as it seldom rests" * (i.held_share < HELD)
             words += [f"first answer not seen{seldom}" if first is None else _after(first, i.first_possible_s[pv])]
             words += [_settles(i, pv)] if gain else []

@@ -107,10 +107,13 @@ def withheld_in(folder: Path) -> dict[str, str]:
     return {law: str(why) for law, why in reasons.items() if why}
 
 
-def because(why: str) -> str:
-    """A stored reason as the end of a sentence, ``because ...``: without the law's name, which stands before it."""
+def because(why: str, *, several: bool = False) -> str:
+    """A stored reason as the end of a sentence, ``because ...``: without the law's name, which stands before it.
+
+    ``several`` laws share it.
+    """
     words = re.sub(r"^law '[^']+' is withheld: ", "", why)
-    words = re.sub(r"^controllers\.\S+ (.*?), so nothing is shipped", r"it \1", words)
+    words = re.sub(r"^controllers\.\S+ (.*?), so nothing is shipped", f"{'each' if several else 'it'} \\1", words)
     return f"because {words.rstrip('. ')}."
 
 
@@ -119,7 +122,7 @@ def by_reason(withheld: Mapping[str, str]) -> dict[str, str]:
     laws: dict[str, list[str]] = {}
     for law, why in withheld.items():
         laws.setdefault(because(why), []).append(law)
-    return {", ".join(names): why for why, names in laws.items()}
+    return {", ".join(names): because(withheld[names[0]], several=len(names) > 1) for names in laws.values()}
 
 
 def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:

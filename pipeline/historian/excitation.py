@@ -200,10 +200,11 @@ def _reasons(
         found.append((1 + (n < LEAST_ROWS_A_PARAMETER * parameters), words))
     for i, values in zip((i for i in inputs if i.role == "mv"), record.mv.T, strict=True):
         span = float(np.ptp(values)) if n else 0.0
+        moved = f"{i.name} made {i.moves} moves of {100 * MOVE_SHARE:g} % of its span or more"
         if i.moves < FEW_MOVES:
-            found.append((2, f"{i.name} made {i.moves} moves of {100 * MOVE_SHARE:g} % of its span or more: too few"))
+            found.append((2, f"{moved}: too few"))
         elif i.moves < ENOUGH_MOVES:
-            found.append((1, f"{i.name} made {i.moves} informative moves; {ENOUGH_MOVES} are wanted"))
+            found.append((1, f"{moved}; {ENOUGH_MOVES} are wanted"))
         if i.moves >= FEW_MOVES and not _answered(i):
             words = f"no process variable answers to {i.name}: check the tag, its times, and the PVs"
             if any(s > FOLLOWS for s in i.follows.values()):

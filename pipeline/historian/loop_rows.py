@@ -16,6 +16,7 @@ from pipeline.metrics import Array
 from pipeline.records.set_points import SetPoints
 
 AUTOMATIC = re.compile(r"a|aut.*|r?cas.*|kas.*", re.IGNORECASE)  # names of modes in which a controller moves the MV
+MANUAL = re.compile(r"m|i?man.*|hand", re.IGNORECASE)  # and in which a person does
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,6 +28,7 @@ class LoopRows:
     own_mvs: tuple[Tag, ...]  # the MV of the same name; where no name tells, all of them
     same_name: bool  # whether a name tells
     automatic: bool  # whether a mode says which rows these are
+    manual: bool  # whether a mode says that it was in manual in each of them: no controller was at work
     rows: NDArray[np.bool_]  # of the grid
     piece: NDArray[np.int64]  # (n,) counts up where rows are left out: what the MV did meanwhile is not this loop's
 
@@ -43,7 +45,8 @@ def loops(
             continue
         mv = _partner(sp, mvs, -1)
         rows = (code == 0) & ~np.isnan(grid.value[sp.tag])
-        auto = _automatic(grid.value[mode.tag], modes[mode.tag]) if mode is not None else None
+        auto = _named(AUTOMATIC, grid.value[mode.tag], modes[mode.tag]) if mode is not None else None
+        hand = _named(MANUAL, grid.value[mode.tag], modes[mode.tag]) if mode is not None else None
         known = auto is not None and bool(np.any(rows & auto))
         if auto is not None and known:
             rows = rows & auto
@@ -51,7 +54,8 @@ def loops(
             continue
         kept = np.flatnonzero(rows)
         piece = grid.piece[rows] + np.cumsum(np.diff(kept, prepend=kept[0] - 1) > 1)
-        yield LoopRows(sp, pv, tuple(mvs) if mv is None else (mv,), mv is not None, known, rows, piece)
+        own, by_hand = tuple(mvs) if mv is None else (mv,), hand is not None and bool(hand[rows].all())
+        yield LoopRows(sp, pv, own, mv is not None, known, by_hand, rows, piece)
 
 
 def set_points(
@@ -76,7 +80,7 @@ def _partner(sp: Tag, tags: Sequence[Tag], place: int) -> Tag | None:
     return tags[place] if 0 <= place < len(tags) else None
 
 
-def _automatic(mode: Array, names: Sequence[str]) -> NDArray[np.bool_] | None:
-    """Rows (n,) whose mode is an automatic one; None where no mode of the tag is known as such."""
-    known = [i for i, name in enumerate(names) if AUTOMATIC.fullmatch(name.strip())]
+def _named(kind: re.Pattern[str], mode: Array, names: Sequence[str]) -> NDArray[np.bool_] | None:
+    """Rows (n,) whose mode has a name of a kind; None where no mode of the tag has one."""
+    known = [i for i, name in enumerate(names) if kind.fullmatch(name.strip())]
     return np.isin(mode, known) if known else None

@@ -152,6 +152,8 @@ def identified(grid: Grid, loop: LoopRows, mv: Tag) -> OldController:
     """
     rows = [grid.value[t.tag][loop.rows].astype(np.float64) for t in (loop.sp, loop.pv, mv)]
     piece = loop.piece if loop.automatic else _without_rests(rows[-1], loop.piece)
+    if loop.manual:
+        return _unknown(loop, mv, "the loop was in manual in all rows")
     best: Fitted | None = None
     for length in WINDOWS:
         late = [(n, w) for n in LATE if (w := _windows(rows, piece, grid.period_s, length, n, mv)).enough]
@@ -163,11 +165,16 @@ def identified(grid: Grid, loop: LoopRows, mv: Tag) -> OldController:
     return _law(best, loop, mv)
 
 
-def _law(found: Fitted | None, loop: LoopRows, mv: Tag) -> OldController:
+def _unknown(loop: LoopRows, mv: Tag, why: str) -> OldController:
     signals = loop.pv.name, mv.name, loop.pv.unit, mv.unit
+    return OldController(*signals, 0.0, 0.0, 0.0, 0.0, 0, 0, 0, 0.0, loop.same_name, why)
+
+
+def _law(found: Fitted | None, loop: LoopRows, mv: Tag) -> OldController:
     if found is None:
         few = f"{np.count_nonzero(loop.rows)} rows are too few in which the loop is at work and the MV moves"
-        return OldController(*signals, 0.0, 0.0, 0.0, 0.0, 0, 0, 0, 0.0, loop.same_name, few)
+        return _unknown(loop, mv, few)
+    signals = loop.pv.name, mv.name, loop.pv.unit, mv.unit
     kc, on_sp, integral, derivative = (float(v) for v in found.numbers)
     return OldController(
         *signals,

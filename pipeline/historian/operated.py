@@ -16,9 +16,14 @@ from pipeline.records.operated import Operated, operation
 def operated(
     grid: Grid, code: NDArray[np.uint8], tags: Sequence[Tag], modes: Mapping[str, Sequence[str]]
 ) -> tuple[Operated, ...]:
-    """The loops whose set point is known. ``code`` (n,) is 0 in rows of the record, ``modes`` are names by tag."""
+    """The loops whose set point is known, without those that were in manual all the time: nothing followed it.
+
+    ``code`` (n,) is 0 in rows of the record, ``modes`` are names by tag.
+    """
     mvs, found = [t for t in tags if t.role == "mv"], []
     for loop in loops(grid, code, tags, modes):
+        if loop.manual:
+            continue
         rows, pv = loop.rows, loop.pv
         moves = np.column_stack([grid.value[t.tag][rows] for t in mvs]).astype(np.float64)
         error, travel = operation(

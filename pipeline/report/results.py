@@ -69,9 +69,9 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
             "!          number of closed loops that locked up; the law reproduces a paper: do not run it on a plant"
         )
     best = None
+    if any(standing.hidden for name, standing in standings.items() if case in (None, name)):
+        console.print("n          noise can hide more than the bound: the ratio is to the hidden error, at least 1")
     if case is None:
-        if any(standing.hidden for standing in standings.values()):
-            console.print("n          noise can hide more than the bound: the ratio is to the hidden error, at least 1")
         if any(_ahead(law) for of in standings.values() if of.times == "× NMPC" for law in of.laws):
             console.print(
                 "below 1    ahead of the NMPC, which knows the plant but no load before it shows, and plans so far"

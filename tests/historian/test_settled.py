@@ -11,6 +11,7 @@ from dirty_plant import PERIOD_S, START_S, Clean, clean, screen_of
 from scipy.signal import lfilter
 
 from pipeline.commands.new_printed import sayings
+from pipeline.config.known import Known
 from pipeline.historian import settled
 from pipeline.historian.findings import Finding, InputReport
 from pipeline.historian.loads import load_sd
@@ -144,3 +145,7 @@ def test_every_pair_is_asked_for_where_nothing_is_clear(tmp_path: Path) -> None:
     silent = replace(verdict.inputs[0], gain={"TIC-101.PV": 0.0}, rate={}, first_answer_s={})
     (line,) = sayings(replace(verdict, inputs=(silent,)), {})
     assert "not clear from the record" in line
+    assert line.endswith("?")
+    known = [Known("TIC-101.PV", silent.name, "+")]
+    (line,) = sayings(replace(verdict, inputs=(silent,)), {}, known)
+    assert not line.endswith("?")  # of what an engineer says nobody is asked again

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.historian.grid import Grid
+from pipeline.historian.old_controller import old_controllers
 from pipeline.historian.operated import operated
 from pipeline.historian.tags import Tag
 from pipeline.records.operated import operation
@@ -47,6 +48,14 @@ def test_rows_in_automatic_count_where_a_mode_says_which_they_are(
     assert (found.pv, found.rows, found.automatic) == ("T", rows, automatic)
     assert found.mae == pytest.approx(mae)
     assert found.travel == pytest.approx({"valve": travel})
+
+
+@pytest.mark.parametrize("names", [("MAN",), ("M", "AUTO"), ("Manual", "LOCKED")])
+def test_a_loop_that_was_in_manual_all_the_time_followed_no_set_point(names: tuple[str, ...]) -> None:
+    modes, rows = {"TIC-1/MODE": names}, np.zeros(6, dtype=np.uint8)
+    assert operated(grid([0] * 6), rows, TAGS, modes) == ()
+    (law,) = old_controllers(grid([0] * 6), rows, TAGS, modes)
+    assert (law.believed, law.same_name, law.rows) == (False, True, 0)  # the tags belong together all the same
 
 
 def test_without_a_set_point_there_is_no_figure() -> None:
