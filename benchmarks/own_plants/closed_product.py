@@ -96,12 +96,16 @@ def paced(plant: OwnPlant, law: Steps, period_s: float) -> Steps:
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """A file as `loopwright new` reads it: the record, and why it is not used, empty where it is."""
+    """A file as `loopwright new` reads it: the record, and why it is not used, empty where it is.
+
+    ``held``: PV -> the sign by which its old loop held it, of a plant of one loop.
+    """
 
     record: Record
     signals: Signals
     refused: str
     verdict: str
+    held: dict[str, int]
 
 
 def read(file: Path, options: Sequence[str]) -> Read:
@@ -116,7 +120,9 @@ def read(file: Path, options: Sequence[str]) -> Read:
     record, why = found.record, refusal(found, tags, anyway=False)
     n = min(len(record.pv_signals), len(record.mv_signals))
     signals = Signals(record.period_s, record.pv_signals[:n], record.pv_signals, record.dv_signals, record.mv_signals)
-    return Read(record, signals, "" if why is None else why.why, found.report.verdict.carries)
+    believed = [law for law in found.report.old_controllers if law.believed]
+    held = {law.pv: 1 if law.kc > 0 else -1 for law in believed} if n == 1 else {}
+    return Read(record, signals, "" if why is None else why.why, found.report.verdict.carries, held)
 
 
 def fitted(found: Read, minutes: float | None = None) -> tuple[Identified, str]:
@@ -124,7 +130,7 @@ def fitted(found: Read, minutes: float | None = None) -> tuple[Identified, str]:
 
     ``minutes`` is the budget of its search; None: the default.
     """
-    learnt = IdentifiedPart(minutes=minutes).learn(Source(found.record, found.signals))
+    learnt = IdentifiedPart(minutes=minutes).learn(Source(found.record, found.signals, held=found.held))
     parts = {"identified": {"kind": "identified", "per_seed": {"0": learnt.metrics}}}
     return learnt.model, sign_doubts({"": {"parts": parts}})
 

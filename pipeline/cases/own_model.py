@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from pipeline.errors import PlantError
+from pipeline.historian.pace import MOST_PERIODS
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
@@ -17,6 +18,8 @@ from pipeline.plants.spoilt import SpoiltPlant, likely_error
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
 LEAST_GAIN, LEAST_PACE, LEAST_DEAD = 0.25, 0.25, 1.0
 MOST_GAIN, MOST_PACE, MOST_DEAD = 1.0, 0.8, 5.0  # twice the gain; beyond that a record tells nothing worth a test
+
+VISITED = 2.0  # standard deviations of an output in the record
 
 
 class Doubts(NamedTuple):
@@ -51,6 +54,23 @@ class OwnPlant(IdentifiedPlant):
     colour: Array
     doubts: Doubts
     rest: tuple[Array, Array] | None = None
+
+    @property
+    def foreseen(self) -> int:
+        """As far as predictive control looks ahead at most: of what comes later a record with loads says little."""
+        return MOST_PERIODS
+
+    @property
+    def asked(self) -> tuple[Array, Array]:
+        """The outputs that the record visited, two standard deviations to each side, within the set points' ranges.
+
+        A range is often a transmitter's: moves over all of it drive an MV to its ends, and what suits them is too slow
+        for what operators ask for.
+        """
+        low, high = super().asked
+        n, of = len(low), self.arrays
+        middle, half = of.y_center[:n], VISITED * of.y_scale[:n]
+        return np.clip(middle - half, low, high), np.clip(middle + half, low, high)
 
     @property
     def noise_std(self) -> Array:

@@ -19,7 +19,7 @@ from pipeline.cases.own_entries import OLD_LOOP
 from pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
 from pipeline.cases.reach import TIMES
 from pipeline.config.known import together
-from pipeline.config.params import sections_of
+from pipeline.config.params import read_section, sections_of
 from pipeline.config.plants import MvParams, PlantParams, SignalParams
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.closed_loop import RANGE_BAND, closed_loop_metrics
@@ -292,6 +292,7 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         "models": models,
         "data": params.data,
         "known": together(params.known),
+        "held": _held(name, params),
         "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
         "__module__": base.__module__,
         **({"gate": GATE_WITH_MEASURED} if dv else {}),
@@ -302,6 +303,18 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         ),
     }
     return type("OwnPlantCase", (base,), own | further)((9001, 9002, 9003))
+
+
+def _held(name: str, params: PlantParams) -> dict[str, int]:
+    """PV -> sign of the gain of its old PI, of a plant of one loop; empty where that is not known.
+
+    An integral part that held its PV has the sign of the plant's own steady gain: with the other one the loop would
+    have run away. Of several loops it is the sign with the others at work, which need not be that of the plant.
+    """
+    if len(params.mv) > 1 or f"{name}-{OLD_LOOP}" not in sections_of("controllers", name):
+        return {}
+    kc = read_section("controllers", f"{name}-{OLD_LOOP}").get("kc")
+    return {params.pv[0].name: 1 if kc > 0 else -1} if isinstance(kc, int | float) and kc else {}
 
 
 def mae_of(cv: Signal) -> str:

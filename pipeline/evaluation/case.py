@@ -122,6 +122,7 @@ class Case(ABC):
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
     noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
     known: ClassVar[tuple[Known, ...]] = ()  # of pairs of PV and input, by an engineer
+    held: ClassVar[Mapping[str, int]] = {}  # PV -> sign of its answer to the MV, by the old loop that held it with that
     on_models: ClassVar[bool] = False  # the tests run on models of the plant's record
     stand_in: ClassVar[str] = "identified"  # what they run on in the plant's place: such models, or a simulator
     reads: ClassVar[tuple[Path, ...]] = ()  # files, beside the code, that the tests run

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pipeline.evaluation.known import decides, known_of, question
+from pipeline.evaluation.known import TIMES, decides, known_of, question
 from pipeline.evaluation.model_evidence import Metrics, identified_part
 from pipeline.evaluation.validation import Statement
 
@@ -14,9 +14,11 @@ SHARE = 0.8  # free-run error over the PV's deviation, noise and all: a model th
 FORESEEN = 10.0  # nats: odds of 20,000 to 1 for a model whose MVs move the PV
 COUPLED = 0.25  # of the model's own worth, that integral action of several loops keeps whatever open answers are
 LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
+HINTED = 5.0  # nats, odds of 150 to 1, that suffice beside the sign by which the old loop held the plant
 BY_REGION = ("turns", "fades")  # verdicts on answers that hold by the regions of the MV's range
 FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
 LITTLE = "the record leaves its sign open; beside the other answers it decides nothing, and all loops stand either"
+OLD_LOOP = "the record leaves it open; it holds by the old controller's sign, with which it held the plant"
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
     "`loopwright new` lists them in step_test.csv, and give these rows too"
@@ -138,9 +140,10 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
             because += f"; an engineer says {known['says']!r}: is it so in all of the range?"
     else:
         little = not known and _matters_little(pv, found, proof, shown=shown)
-        holds = little or _holds(found, known, shown=foreseen)
+        held = _by_the_old_loop(pv, found, known, proof)
+        holds = little or held or _holds(found, known, shown=foreseen)
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
-        because = LITTLE if little else _word(found, known, holds=holds) or _why(pv, mv, found)
+        because = LITTLE if little else OLD_LOOP if held else _word(found, known, holds=holds) or _why(pv, mv, found)
     return Statement(
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         limit,
@@ -148,6 +151,20 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
         holds,
         because,
     )
+
+
+def _by_the_old_loop(pv: str, found: Mapping[str, Any], known: Mapping[str, Any], proof: Mapping[str, Any]) -> bool:
+    """Whether an uncertain answer holds by the sign with which the old loop held the plant, where nobody says another.
+
+    The model, all that are as likely, and one-step predictions must have it, these by ``LIKELY`` standard deviations;
+    and the inputs must foresee something of the PV, by ``HINTED``. A controller that was read backwards has the other.
+    """
+    way, nats = (proof.get("held") or {}).get(pv, 0), ((proof.get("one_step") or {}).get(pv) or {}).get("nats", 0.0)
+    if not way or known or nats < HINTED or found["verdict"] != "uncertain" or found["direct"] is None:
+        return False
+    least = min(way * found[name] for name in ("model", "low", "high"))
+    direct = way * found["direct"]
+    return bool(least > 0 and direct >= LIKELY * found["sd"] and direct + found["sd"] <= TIMES * way * found["model"])
 
 
 def _matters_little(pv: str, found: Mapping[str, Any], proof: Mapping[str, Any], *, shown: bool) -> bool:

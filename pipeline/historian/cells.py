@@ -77,6 +77,18 @@ def noise_sd(values: Array) -> float:
     return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0)) if second.size else 0.0
 
 
+def slips_of(values: Array, role: str) -> tuple[Where, Counter[str]]:
+    """``unit_slips`` of finite readings (n,) of a tag with a role.
+
+    Of an MV few conversions count, and its zeros do not, nor those of a measured disturbance: a closed valve and a flow
+    that stopped are 0 in every unit.
+    """
+    counts = values != 0.0 if role in {"mv", "dv"} else np.ones(len(values), dtype=bool)
+    where = np.zeros(len(values), dtype=bool)
+    where[counts], found = unit_slips(values[counts], MV_CONVERSIONS if role == "mv" else ())
+    return where, found
+
+
 def unit_slips(values: Array, kinds: Sequence[str] = ()) -> tuple[Where, Counter[str]]:
     """Where (n,) the values are in another unit for a while: a jump by a known conversion, and the jump back.
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.cells import unit_slips, usual
+from pipeline.historian.cells import slips_of, usual
 from pipeline.historian.character import smallest_difference
 from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, moves_of
 from pipeline.historian.export import Export, Series
@@ -272,7 +272,7 @@ def _plain(series: Series, tag: Tag) -> tuple[Array, NDArray[np.bool_], Counter[
     """Readings that are no code for a missing value and no slip of the unit; where codes are (n,), how often each."""
     codes, found = sentinels(np.where(series.code == Reason.GOOD, series.value, np.nan), tag)
     plain = series.value[series.good & ~codes]
-    return plain[~unit_slips(plain)[0]], codes, found
+    return plain[~slips_of(plain, tag.role)[0]], codes, found
 
 
 def _range(values: Sequence[float] | np.ndarray, unit: str, role: str) -> tuple[float | None, float | None]:

@@ -16,6 +16,7 @@ from pipeline.records.old_controller import OldController
 
 WINDOWS = (600, 200, 60, 20)  # rows
 LEAST_WINDOWS = 12  # of a length, or too few are left to fit, to choose and to score
+FEWEST_ASKED = 2  # windows with a moving set point that count by themselves
 LATE = (0, 1)  # rows: in some exports the PV of a row is what the MV of that row made
 FIT, CHOICE, SCORE = range(3)  # what every third window is for
 ROUNDS = 8  # of leaving out windows in which something else moved the MV
@@ -56,6 +57,11 @@ class Windows:
     def taken(self, use: int) -> Windows:
         """Every third window."""
         return Windows(self.moved[use::3], self.parts[use::3])
+
+    def asked(self) -> Windows:
+        """Those in which the set point moves: they alone tell how the law answers to it."""
+        moves = np.abs(self.parts[..., 1]).max(axis=1) > 0
+        return Windows(self.moved[moves], self.parts[moves])
 
     def errors(self, numbers: Array) -> Array:
         """Sum of squared errors of the law with ``numbers`` (4,) in each window (W,)."""
@@ -99,13 +105,16 @@ class Fitted:
     basis: tuple[Array, ...]
     late: int
     numbers: Array
-    unexplained: float  # of the windows for the choice
+    unexplained: float  # of the windows for the choice, or of those in which the set point moves where that is more
 
     @classmethod
     def of(cls, windows: Windows, basis: tuple[Array, ...], late: int) -> Fitted:
         """Fitted on its third of the windows."""
-        numbers = windows.taken(FIT).fitted(basis)
-        return cls(windows, basis, late, numbers, windows.taken(CHOICE).unexplained(numbers))
+        numbers, asked = windows.taken(FIT).fitted(basis), windows.asked()
+        unexplained = windows.taken(CHOICE).unexplained(numbers)
+        if len(asked.moved) >= FEWEST_ASKED:  # they may be few, and half of all movement lies without them
+            unexplained = max(unexplained, asked.unexplained(numbers))
+        return cls(windows, basis, late, numbers, unexplained)
 
     @property
     def share(self) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RecordError
-from pipeline.historian.cells import MV_CONVERSIONS, outliers, unit_slips, usual
+from pipeline.historian.cells import outliers, slips_of, usual
 from pipeline.historian.decimal_sign import COMMA_DECIMAL, POINT_DECIMAL
 from pipeline.historian.export import Series
 from pipeline.historian.findings import Finding, Verdict, counted
@@ -64,8 +64,8 @@ def clean(series: Series, tag: Tag) -> list[Finding]:
     if tag.role in {"pv", "dv"}:
         found += _unlike_the_rest(series, tag)
     elif tag.role == "mv" and not tag.unit_certain:
-        place = np.flatnonzero(series.good & (series.value != 0.0))  # zero is a closed valve in every unit
-        found += _slipped(series, tag, place, *unit_slips(series.value[place], MV_CONVERSIONS))
+        place = np.flatnonzero(series.good)
+        found += _slipped(series, tag, place, *slips_of(series.value[place], tag.role))
     return found
 
 
@@ -136,10 +136,9 @@ def _unlike_the_rest(series: Series, tag: Tag) -> list[Finding]:
     values = series.value[place]
     calm = ~outliers(values)
     slipped = np.zeros(len(values), dtype=bool)
-    unlike_zero = calm & (values != 0.0) if tag.role == "dv" else calm  # a flow that stopped is 0 in every unit
     kinds = Counter[str]()
     if not tag.unit_certain:
-        slipped[unlike_zero], kinds = unit_slips(values[unlike_zero])
+        slipped[calm], kinds = slips_of(values[calm], tag.role)
     found += _slipped(series, tag, place, slipped, kinds)
     place, values = place[~slipped], values[~slipped]
     alone = outliers(values) if slipped.any() else ~calm

@@ -33,7 +33,8 @@ class Source:
 
     ``record`` is None for a set that is made from equations. ``regions`` are ranges of the controlled variable, for
     the figures only. ``plant`` is for parts that are made from equations or compared with the plant. ``known`` is what
-    an engineer knows of pairs of PV and input.
+    an engineer knows of pairs of PV and input. ``held``: PV -> sign of its answer to the MV, by the old loop that held
+    it with that.
     """
 
     record: Record | None
@@ -43,6 +44,7 @@ class Source:
     plant: Simulator | None = None
     groundwork: Mapping[Groundwork[Any], Any] = field(default_factory=dict)  # what is done already, and its results
     known: tuple[Known, ...] = ()
+    held: Mapping[str, int] = field(default_factory=dict)
 
     def result(self, work: Groundwork[Result_co]) -> Result_co:
         """The result of a groundwork, which is done now where nobody has done it before."""

@@ -81,6 +81,17 @@ class Simulator(ABC):
         """Colour phi (n_pv,) of the measurement noise e(k) = phi e(k-1) + w(k): 0 of white noise."""
         return np.zeros(len(self.pv_signals))
 
+    @property
+    def foreseen(self) -> int | None:
+        """Samples after a move over which its answer is known; None: all."""
+        return None
+
+    @property
+    def asked(self) -> tuple[Array, Array]:
+        """Lowest and highest set points (n_cv,) that loops are tuned for: the ends of their ranges."""
+        low, high = (np.array([getattr(s, end) for s in self.sp_signals]) for end in ("low", "high"))
+        return low, high
+
     def variations(self) -> tuple[Simulator, ...]:
         """The plants that a tuning must suit: this one, and what it may be where its equations are not certain."""
         return (self,)

@@ -39,6 +39,16 @@ class SpoiltPlant(Simulator):
         return self.plant.dv_nominal
 
     @property
+    def foreseen(self) -> int | None:
+        """Samples over which an answer is known: those of the plant."""
+        return self.plant.foreseen
+
+    @property
+    def asked(self) -> tuple[Array, Array]:
+        """Set points that loops are tuned for: those of the plant."""
+        return self.plant.asked
+
+    @property
     def noise_std(self) -> Array:
         """Standard deviation of the measurement noise, shape (n_pv,)."""
         return self.plant.noise_std

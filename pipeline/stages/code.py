@@ -105,14 +105,16 @@ def _data_of(stage: str, case: str) -> tuple[Path, ...]:
 def _read_of(stage: str, case: str) -> list[Any]:
     """What a stage reads of params.yaml beside its own section.
 
-    Of an own plant its signals; a design the loop that it was run by before, which stands beside each controller; a
-    report the case too, and which controllers and models it lists.
+    Of an own plant its signals; a fit which way the loop that it was run by before acts; a design that loop, which
+    stands beside each controller; a report the case too, and which controllers and models it lists.
     """
     if not case:
         return []
     own = [_plant_of(stage, case)] if case in sections("plants") else []
     if stage == "design" and (old := all_cases()[case].old_loop):
         own.append(read_section("controllers", f"{case}-{old}"))
+    if stage == "fit" and (held := all_cases()[case].held):
+        own.append(dict(held))
     if stage != "report":
         return own
     case_and_plant = [*([read_section("cases", case)] if case in sections("cases") else []), *own]

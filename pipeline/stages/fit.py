@@ -107,7 +107,7 @@ def _learn(
 def _source(data: Mapping[int, Path | None], case: Case, seed: int) -> Source:
     path = data[seed]
     record = None if path is None else Record.read(path, case.record_signals)
-    return Source(record, case.plant.signals, case.regions, seed, case.plant, known=case.known)
+    return Source(record, case.plant.signals, case.regions, seed, case.plant, known=case.known, held=case.held)
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -159,14 +159,14 @@ def _check(seeds: tuple[int, ...], set_points: int, hold: int) -> None:
 def _reachable(plant: Simulator, set_points: int, rng: np.random.Generator) -> Array:
     """Set points (set_points, n_cv) at which the plant rests under MVs within their ranges."""
     mv_low, mv_high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
-    low, high = (np.array([getattr(s, end) for s in plant.sp_signals]) for end in ("low", "high"))
-    inset, count = WITHIN * (mv_high - mv_low), DRAWN * set_points
+    low, high = plant.asked
+    inset, count, resting = WITHIN * (mv_high - mv_low), DRAWN * set_points, plant.foreseen or RESTING
     mv = rng.uniform(mv_low + inset, mv_high - inset, (count, len(mv_low)))
     x, advance, late = np.tile(plant.start[0], (count, 1)), plant.many(count), np.empty(0)
     with np.errstate(all="ignore"):  # an integrator may run away
-        for k in range(RESTING):
+        for k in range(resting):
             x = advance(x, mv)
-            if k == RESTING - RESTING // 5:
+            if k == resting - resting // 5:
                 late = plant.measured(x)[:, : len(low)]
     ends = plant.measured(x)[:, : len(low)]
     restless = np.median(np.abs(ends - late), axis=0) > MOVING * (high - low)

@@ -16,6 +16,7 @@ STEP = 0.01  # of an MV's range
 SHORTEST, LONGEST = 100, 3200  # samples of a response
 STILL = 0.01  # of its largest change, over its last fifth: a response that has settled
 EVEN = 0.05  # relative difference of two slopes that are the same
+RAMP = 0.5  # of a response's largest change, that its last slope makes over all of it: less is a creeping rest
 SETTLED = 0.05  # of the end
 ANSWERS = 0.1  # of the fastest change in a period
 
@@ -34,7 +35,7 @@ class StepResponses:
     """Changes of each controlled variable after a step of each MV, near the start of a plant.
 
     ``y[i, j, k]`` [pv/mv]: of CV i, k + 1 periods after a unit step of MV j. ``slope[i, j]`` [pv/mv a period]: of
-    its last fifth, 0 where it has settled.
+    its last fifth, 0 where it has settled, or creeps on by little beside what it did before.
     """
 
     y: Array  # (n_cv, n_mv, n)
@@ -47,7 +48,8 @@ class StepResponses:
         """Central differences of runs with each MV a little above and below, one-sided at the end of a range.
 
         A model may rest where no MV gets: then the nearest ones are moved.
-        They are as long as it takes to settle, or to rise or fall evenly. LawError where a run is not finite.
+        They are as long as it takes to settle, or to rise or fall evenly, or as the plant's answers are known: a slow
+        pole of a model, which its record leaves open, can turn them round later. LawError where a run is not finite.
         """
         x0, mv0 = plant.start
         low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
@@ -57,7 +59,8 @@ class StepResponses:
         mv = np.concatenate(ends)
         x, advance = np.tile(x0, (len(mv), 1)), plant.many(len(mv))
         rows: list[Array] = []
-        n = SHORTEST
+        longest = plant.foreseen or LONGEST
+        n = min(SHORTEST, longest)
         while True:
             while len(rows) < n:
                 x = advance(x, mv)
@@ -67,9 +70,10 @@ class StepResponses:
             if not np.all(np.isfinite(y)):
                 raise LawError(f"a step response of plant {plant.name!r} is not finite within {n} periods of its start")
             slope = _slopes(y)
-            if n >= LONGEST or _known(y, slope):
+            if n >= longest or _known(y, slope):
                 spans = (np.array([s.high - s.low for s in plant.sp_signals]), high - low)
-                return cls(y, np.where(_settled(y), 0.0, slope[-1]), plant.period_s, spans)
+                ramp = np.abs(slope[-1]) * n >= RAMP * np.abs(y).max(axis=-1)
+                return cls(y, np.where(ramp & ~_settled(y), slope[-1], 0.0), plant.period_s, spans)
             n *= 2
 
     @property
@@ -90,10 +94,24 @@ class StepResponses:
 
     @property
     def settling(self) -> int:
-        """Samples until the slowest response that comes to rest stays within 5 % of its end; 0 where none does."""
-        rests = self.y[self.slope == 0]
+        """Samples until the slowest response that comes to rest stays within 5 % of its end; 0 where none does.
+
+        Of one that creeps, until it goes on as it does over its last fifth.
+        """
+        n = self.y.shape[-1]
+        creeps = np.where(_settled(self.y), 0.0, _slopes(self.y)[-1])
+        rests = (self.y + creeps[..., None] * (n - 1 - np.arange(n)))[self.slope == 0]
         away = [np.flatnonzero(np.abs(y - y[-1]) > SETTLED * np.abs(y).max()) for y in rests if np.abs(y).max() > 0]
         return max((int(at[-1]) + 2 for at in away if at.size), default=1 if len(rests) else 0)
+
+    def crossing(self, width: Array) -> int:
+        """Samples in which the strongest MV, over its range, carries each integrating CV across ``width`` (n_cv,).
+
+        No loop could be faster. 0 where no CV integrates.
+        """
+        fastest = (np.abs(self.slope) * self.spans[1]).max(axis=1)
+        needed = np.where(self.integrates, width / np.where(fastest > 0, fastest, np.inf), 0.0)
+        return int(np.ceil(needed.max()))
 
     def answers_after(self, cv: int, mv: int) -> int:
         """Samples from the step to the first one at which the CV has answered: 1 without a dead time.

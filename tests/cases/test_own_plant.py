@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import yaml
 
 from pipeline.cases import CASES, all_cases
 from pipeline.cases.loads import LOAD
-from pipeline.cases.own_model import LEAST_GAIN, Doubts
+from pipeline.cases.own_model import LEAST_GAIN, Doubts, OwnPlant
 from pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
 from pipeline.errors import ParamsError, PlantError
+from pipeline.historian.pace import MOST_PERIODS
 from pipeline.plants.signals import Signals
+from pipeline.plants.spoilt import SpoiltPlant
 from pipeline.records.record import Record
 from pipeline.simulation.simulate import noise_draws, simulate_closed
 from serving.manifest import Signal
@@ -175,3 +178,15 @@ def test_a_wrong_section_is_one_line(heater: OwnCase, tmp_path: Path, change: di
         own_case("heater")
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_loops_are_tuned_for_what_the_record_visited_and_not_for_a_transmitters_range(heater: OwnCase) -> None:
+    plant = heater.plant
+    assert isinstance(plant, OwnPlant)
+    low, high = plant.asked
+    assert (low[0], high[0]) == pytest.approx((20.0, 90.0))  # two standard deviations of 20 reach beyond 90
+    narrow = replace(plant.arrays, y_scale=plant.arrays.y_scale / 10)
+    of = OwnPlant(plant.signals, narrow)
+    assert of.asked == (pytest.approx([46.0]), pytest.approx([54.0]))
+    assert SpoiltPlant(of, {}).asked == of.asked
+    assert SpoiltPlant(of, {}).foreseen == of.foreseen == MOST_PERIODS

@@ -102,6 +102,31 @@ def test_what_is_foreseen_makes_up_for_a_sign_that_is_nearly_certain(
     assert (sign_doubts(in_closed_loop(nats, **{**UNCERTAIN, **answer})) == "") is ships
 
 
+@pytest.mark.parametrize(
+    ("nats", "way", "answer", "ships"),
+    [
+        (5.0, 1, {}, True),  # two standard deviations, and half of the odds that would do by themselves
+        (5.0, -1, {}, False),  # the controller, read backwards
+        (5.0, 0, {}, False),
+        (4.9, 1, {}, False),
+        (5.0, 1, {"sd": 0.7}, False),
+        (5.0, 1, {"low": -0.1}, False),
+        (5.0, 1, {"direct": -1.0}, False),
+        (5.0, 1, {"direct": 6.0, "sd": 2.5}, False),  # more than three times the model's
+        (5.0, 1, {"verdict": "halves"}, False),
+    ],
+)
+def test_the_sign_by_which_the_old_loop_held_the_plant_decides_what_the_record_leaves_open(
+    nats: float, way: int, answer: dict[str, Any], ships: bool
+) -> None:
+    found = in_closed_loop(nats, **{**UNCERTAIN, **answer})
+    found[""]["parts"]["identified"]["per_seed"]["0"]["proof"]["held"] = {"y0": way} if way else {}
+    assert (sign_doubts(found) == "") is ships
+    known = {"pv": "y0", "input": "u0", "says": "-", "way": -1, "size": False, "verdict": "open"}
+    found[""]["parts"]["identified"]["per_seed"]["0"]["proof"]["known"] = [known]
+    assert sign_doubts(found) != ""  # somebody says another
+
+
 REGION = {name: ANSWER[name] for name in ("model", "low", "high", "first", "last", "direct", "sd", "halves", "verdict")}
 RISES = {**REGION, "from": 10.0, "to": 40.0, "small": False}
 FLAT = {**REGION, "from": 40.0, "to": 60.0, "small": True, "verdict": "opposite"}

@@ -100,6 +100,18 @@ def test_a_label_is_no_mv(head: str, tmp_path: Path) -> None:
     assert found == {head: "", "LI-1": "pv", "HV-1": "mv"}
 
 
+@pytest.mark.parametrize("stopped", [slice(1400, 1520), slice(0, 60), slice(2950, 3000)])
+def test_a_stop_at_zero_is_no_other_unit(stopped: slice, tmp_path: Path) -> None:
+    """0 is 1000 times 0: the rows before a stop were once taken for a slip, and left out of the guessed range."""
+    random = np.random.default_rng(3)
+    valve = np.clip(np.cumsum(random.normal(0, 1.0, N)) + np.linspace(30, 75, N), 1, 99).round(2)
+    valve[stopped] = 0.0
+    lines = ["time_s,TIC-1.PV,TIC-1.OP", *(f"{10 * k},{50 + random.normal():.3f},{v:g}" for k, v in enumerate(valve))]
+    (path := tmp_path / "export.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    found = {g.tag.tag: g.tag for g in guesses(read_export([path]), units_of([path]))}["TIC-1.OP"]
+    assert (found.low, found.high) == (0.0, valve.max())
+
+
 def test_an_mv_of_two_values_is_one(tmp_path: Path) -> None:
     assert roles(tmp_path / "export.csv", {"LI-1 [m]": "level", "HV-1 [%]": "two"})["HV-1"] == "mv"
 

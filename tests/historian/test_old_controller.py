@@ -33,6 +33,7 @@ def closed(
     late: int = 0,
     digits: int = 1,
     seed: int = 1,
+    moves: int | None = None,
 ) -> Columns:
     """A lag of 200 s with 30 s dead time and a wandering load, under a PID whose MV the export rounds."""
     random = np.random.default_rng(seed)
@@ -43,8 +44,10 @@ def closed(
     pipe = [u] * 4
     for k in range(n):
         y = x + noise[k]
-        if random.random() < 1 / 150:
+        if random.random() < 1 / 150 and (moves is None or k % (n // (moves + 1)) == 0):
             r = random.normal(0, 4)
+        if moves and k and k % (n // (moves + 1)) == 0:
+            r = 4.0 if r <= 0 else -4.0
         if not hand and random.random() < manual / 60:
             hand = 60
         if hand:
@@ -115,6 +118,16 @@ def test_hand_operation_is_not_taken_for_a_controller(tau_s: float, same_row: bo
     (law,) = found(by_hand(tau_s, same_row, hold, seed))
     assert not law.believed
     assert law.doubt in law.words
+
+
+@pytest.mark.parametrize("b", [1.0, 0.0, 0.5])
+@pytest.mark.parametrize("moves", [4, 8])
+def test_few_moves_of_the_set_point_tell_how_the_law_answers_to_them(moves: int, b: float) -> None:
+    """Half of all movement lies in windows without one: there P on the error and P on the PV do the same."""
+    (law,) = found(closed(b=b, moves=moves))
+    assert law.believed, law.doubt
+    assert law.set_point_weight == pytest.approx(b, abs=0.05)
+    assert law.kc == pytest.approx(1.0, rel=0.05)
 
 
 def test_a_proportional_controller_is_not_taken_for_a_pi() -> None:

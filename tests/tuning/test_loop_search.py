@@ -110,6 +110,36 @@ def test_an_integrator_is_a_ramp_with_dead_time() -> None:
     assert process.dead_time_s == pytest.approx(2.0 * 4, rel=0.05)  # the lag, as the ramp sees it
 
 
+@pytest.mark.parametrize("share", [0.1, 0.3])
+def test_a_response_that_creeps_on_is_the_lag_that_it_mostly_is(share: float) -> None:
+    """A pole near 1 with a small part was once taken for a ramp: 1/rate, and with it the first gain, was any size."""
+    slow, fast = 0.9995, 0.95
+    plant = Sampled(np.diag([fast, slow]), [[1 - fast], [1 - slow]], [[1.0, share]])
+    found = StepResponses.near_start(plant)
+    assert not found.integrates.any()
+    process = found.process(0, 0)
+    assert process.tau_s == pytest.approx(-2.0 / np.log(fast), rel=0.6)
+    assert process.rate * process.tau_s == pytest.approx(1.0, rel=0.4)
+    assert found.settling < 1000
+
+
+def test_an_answer_counts_as_far_as_it_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a record with loads the first rows of an answer are sure; a slow pole turned the sign of its end."""
+    plant = Sampled(np.diag([0.95, 0.998]), [[0.05], [0.002]], [[1.0, -1.5]])
+    assert StepResponses.near_start(plant).gain[0, 0] == pytest.approx(-0.5, rel=0.05)
+    monkeypatch.setattr(Sampled, "foreseen", property(lambda self: 60))
+    found = StepResponses.near_start(plant)
+    assert found.y.shape[-1] == 60
+    assert found.gain[0, 0] == pytest.approx(1 - 0.95**60 - 1.5 * (1 - 0.998**60), rel=0.01)
+
+
+def test_an_integrator_is_crossed_by_its_strongest_mv() -> None:
+    found = StepResponses.near_start(tank())
+    width = found.spans[1] * 0.05 * 10
+    assert found.crossing(width) == pytest.approx(10, abs=1)
+    assert StepResponses.near_start(lag(0.9, 0.5, 2)).crossing(np.ones(1)) == 0
+
+
 def test_an_inverse_response_is_seen() -> None:
     plant = Sampled(np.diag([0.9, 0.5]), [[0.3], [0.5]], [[1.0, -1.0]])
     assert StepResponses.near_start(plant).starts_inverse(0, 0)

@@ -75,9 +75,10 @@ class PID(ControlLaw):
         optimized with the filter. ``operating_cv`` [pv]: steady state of the linearization if the model
         set has no part ``linearized``; None is the middle of the set-point range.
         ``development_seeds``, ``development_set_points``, ``development_hold``: random set points for
-        ``optimized``; each seed gives so many, each held for so many samples (None: 100, or twice the settling time
-        of a plant that is known by simulation alone, 30 to 400). ``sampling``: share of a
-        period that ``itae`` counts as dead time; 0.5 is the textbook value, 1 is more cautious.
+        ``optimized``; each seed gives so many, each held for so many samples (None: 100; of a plant that is known by
+        simulation alone, twice the time that it takes to settle, or three times that in which an integrating CV
+        crosses the set points, 60 to 400). ``sampling``: share of a period that ``itae`` counts as dead time; 0.5 is
+        the textbook value, 1 is more cautious.
         ``examined_cv`` [pv]: range of the stability analysis; None: no analysis. ``mv_rate`` [mv]:
         largest MV change per sample, one number or one for each MV; None: that of the plant.
         """

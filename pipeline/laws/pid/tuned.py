@@ -24,7 +24,8 @@ from pipeline.tuning.responses import StepResponses
 from pipeline.tuning.rules import AllPole, PidSettings
 
 HOLD = 100  # samples of a development set point
-HOLDS = (30, 400)  # where it follows the plant's settling time
+TIMES, CROSSINGS = 2, 3  # where it lasts so many times as long as the plant takes to settle, or to cross its range
+HOLDS = (60, 400)  # least and most
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +124,9 @@ def require_numbers(params: Any) -> None:
 def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) -> Tuned:
     """The cheapest numbers in closed loop over the plant and its variations, of the given or the best two pairings."""
     responses = StepResponses.near_start(plant)
-    hold = params.development_hold or int(np.clip(2 * responses.settling, *HOLDS))
+    low, high = plant.asked
+    longest = max(TIMES * responses.settling, CROSSINGS * responses.crossing(high - low))
+    hold = params.development_hold or int(np.clip(longest, *HOLDS))
     drawn = (params.development_seeds, params.development_set_points, hold)
     plants = [DevelopmentLoops.by_simulation(variation, *drawn) for variation in plant.variations()]
     percent = 100 / (signals.sp[0].high - signals.sp[0].low)

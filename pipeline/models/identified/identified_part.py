@@ -181,7 +181,8 @@ class IdentifiedPart(Part):
             "dead_times": dead_times(bands, structure.delays, rows, inputs),
             "proof": _proof(searched, record, proven, runs, noise * scales.y_scale)
             | ({"sign_margin": dict.fromkeys(names[:n_cv], margin)} if np.isfinite(margin) else {})
-            | said,
+            | said
+            | ({"held": dict(source.held)} if source.held else {}),
             "open": {name: values.tolist() for name, values in open_to.items()},
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],
             "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
