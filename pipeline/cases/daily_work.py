@@ -37,9 +37,9 @@ class Day:
 def windows(record: Record, sp: Array, hold: int) -> list[slice]:
     """Windows of rows in which all set points (n, n_cv) are known, as long as ``MOST`` allows, apart.
 
-    None is shorter than ``LEAST`` and three holds of a set point.
+    None is shorter than ``LEAST`` and the hold of a set point.
     """
-    least = max(LEAST, min(3 * hold, MOST))
+    least = max(LEAST, min(hold, MOST))
     found = []
     for part in stretches(np.asarray(np.isfinite(sp).all(axis=1)), record.run, least + 2):
         n = part.stop - part.start - 2

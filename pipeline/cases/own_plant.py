@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pipeline.cases.daily_work import day, spread, windows
+from pipeline.cases.daily_work import LEAST, day, spread, windows
 from pipeline.cases.loads import held_load, load_size, whole_load
 from pipeline.cases.measured_steps import course, level_of
 from pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
@@ -231,13 +231,22 @@ class OwnCase(OwnEnsemble):
 
     @cached_property
     def lacking(self) -> tuple[str, ...]:
-        """Loads that no MV can hold."""
+        """Loads that no MV can hold; and daily work that no row, or none in one piece, shows."""
+        tests = self.scenarios()
         wanted = len(self.signals.sp) * len(self.held_out_seeds)
-        left = len(self.scenarios().get(LOADED, ()))
+        left = len(tests.get(LOADED, ()))
         why = "from where the plant rests, the MVs within their ranges cannot hold any load of this kind"
+        found = []
         if not left:
-            return (f"There is no test with loads: {why}. Its weight goes to the other tests.",)
-        return () if left == wanted else (f"{wanted - left} of {wanted} tests with loads are left out: {why}.",)
+            found.append(f"There is no test with loads: {why}. Its weight goes to the other tests.")
+        elif left < wanted:
+            found.append(f"{wanted - left} of {wanted} tests with loads are left out: {why}.")
+        if DAILY not in tests and self.set_points is not None:
+            found.append(
+                f"There is no test of daily work: it replays {max(LEAST, self.hold)} rows or more in one piece, all loops "
+                "in automatic, and the record has none, or a model does not stay finite over them."
+            )
+        return tuple(found)
 
     def _resting_at(self, plant: OwnPlant) -> Array:
         """Set points (2 hold, n_cv) where a plant rests."""

@@ -21,7 +21,7 @@ LITTLE = "the record leaves its sign open; beside the other answers it decides n
 OLD_LOOP = "the record leaves it open; it holds by the old controller's sign, with which it held the plant"
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
-    "`loopwright new` lists them in step_test.csv, and give these rows too"
+    "`loopwright new` lists them in step_test.csv, and give these rows too; or say with --known what you know of the gain"
 )
 
 

@@ -70,19 +70,20 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
                 title = f"Figure {figure.number}. {figure.title}"
                 keep(f"figure_{figure.number:02d}", _own(evidence, figure), title)
         for name, law in evidence.laws.items():
+            title = "The old loop" if name == evidence.old_loop else law.title
             with suppress(NotMeasuredError):
-                keep(f"closed_loop_{name}", overview_picture(evidence, name), f"{law.title} on {where}")
+                keep(f"closed_loop_{name}", overview_picture(evidence, name), f"{title} on {where}")
                 if name == evidence.best:
                     shutil.copyfile(folder / f"closed_loop_{name}.png", folder / "closed_loop.png")
-                    drawn["closed_loop.png"] = f"{law.title} on {untuned}"
+                    drawn["closed_loop.png"] = f"{title} on {untuned}"
             with suppress(NotMeasuredError):
                 if name in shipped and (test := worst_test(evidence, name)) is not None:
                     words = scenario_name(test, evidence.case.recipe, evidence.case.test_words)
-                    keep(f"worst_{name}", overview_picture(evidence, name, test), f"{law.title} on {words}")
+                    keep(f"worst_{name}", overview_picture(evidence, name, test), f"{title} on {words}")
             with suppress(NotMeasuredError):
                 keep(f"cycle_{name}", *cycle_picture(evidence, name))
             with suppress(NotMeasuredError):
-                keep(f"replay_{name}", replay_picture(evidence, name), f"{law.title}, replayed over the record")
+                keep(f"replay_{name}", replay_picture(evidence, name), f"{title}, replayed over the record")
         for test, sequences in evidence.tests.items():
             if sequences[0].dv is not None:
                 with suppress(NotMeasuredError):

@@ -45,22 +45,25 @@ def own_acceptance(evidence: Evidence) -> list[Statement]:
 def step_test_to_run(evidence: Evidence) -> str:
     """What to do where laws were tested and none is shipped: the step test for a better model; else empty.
 
-    Laws that were not designed, because the record does not prove the model, have it among their reasons.
+    It is the one that `loopwright new` listed, where it doubted the record. Laws that were not designed, because the
+    record does not prove the model, have it among their reasons.
     """
     case = evidence.case
     if case.settling_s is None or not evidence.laws or shipped_laws(evidence):
         return ""
+    old = "Keep the old loop until then. " if evidence.old_loop else ""
+    rows = f"Give its rows with the old ones: loopwright new {case.name} OLD NEW --replace."
+    if evidence.grounds is not None and evidence.grounds.doubt:
+        return f"{old}A step test gives a better model: run that of step_test.csv, which `loopwright new` wrote. {rows}"
     units = {s.name: "" if s.unit in NO_UNIT else f" {s.unit.replace('deg', '°')}" for s in case.record_signals.mv}
     steps = [f"{s.name} by {number(LARGEST * (s.high - s.low))}{units[s.name]}" for s in case.record_signals.mv]
     alone, least, most = (share * case.settling_s for share in (ALONE, min(HOLDS), max(HOLDS)))
     whole = 3 * len(steps) * alone + MOVES * sum(HOLDS) / len(HOLDS) * case.settling_s
-    old = "Keep the old loop until then. " if evidence.old_loop else ""
     each, them = (", each alone", "all of them") if steps[1:] else ("", "it")
     return (
         f"{old}A step test gives a better model: move in manual {', '.join(steps)} to each side, or as much more as "
         f"the plant bears{each}: up, down and back, each held for {in_words(alone)}. Then move {them} {MOVES} times at "
-        f"random within that, held for {in_words(least)} to {in_words(most)}; {in_words(whole)} in all. Give its rows "
-        f"with the old ones: loopwright new {case.name} OLD NEW --replace."
+        f"random within that, held for {in_words(least)} to {in_words(most)}; {in_words(whole)} in all. {rows}"
     )
 
 
