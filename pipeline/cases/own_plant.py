@@ -243,8 +243,8 @@ class OwnCase(OwnEnsemble):
             found.append(f"{wanted - left} of {wanted} tests with loads are left out: {why}.")
         if DAILY not in tests and self.set_points is not None:
             found.append(
-                f"There is no test of daily work: it replays {max(LEAST, self.hold)} rows or more in one piece, all loops "
-                "in automatic, and the record has none, or a model does not stay finite over them."
+                f"There is no test of daily work: it replays {max(LEAST, self.hold)} rows or more in one piece, "
+                "all loops in automatic, and the record has none, or a model does not stay finite over them."
             )
         return tuple(found)
 

@@ -21,7 +21,7 @@ LITTLE = "the record leaves its sign open; beside the other answers it decides n
 OLD_LOOP = "the record leaves it open; it holds by the old controller's sign, with which it held the plant"
 REMEDY = (
     "move the set point, or the MV in manual, in steps that are held about as long as the plant settles, as "
-    "`loopwright new` lists them in step_test.csv, and give these rows too; or say with --known what you know of the gain"
+    "`loopwright new` lists them in step_test.csv, and give these rows too; or say with --known what you know of it"
 )
 
 
@@ -51,8 +51,15 @@ def sign_doubts(models: Mapping[str, Metrics]) -> str:
 def fit_doubts(models: Mapping[str, Metrics]) -> str:
     """What the predictions miss, to go on a sentence; empty if they miss little."""
     proof = identified_part(models).get("proof") or {}
-    missed = [f"{name} ({row.measured})" for name, row in _predictions(proof).items() if not row.holds]
-    return f"not proven: the model misses most of what {', '.join(missed)} does" if missed else ""
+    one_step = proof.get("one_step") or {}
+    rows = {name: row.measured for name, row in _predictions(proof).items() if not row.holds}
+    missed, little = (
+        ", ".join(f"{name} ({words})" for name, words in rows.items() if (name in one_step) is of_one_step)
+        for of_one_step in (False, True)
+    )
+    found = [f"the model misses most of what {missed} does"] * bool(missed)
+    found += [f"the inputs foresee too little of {little}"] * bool(little)
+    return f"not proven: {'; '.join(found)}" if found else ""
 
 
 def _predictions(proof: Mapping[str, Any]) -> dict[str, Statement]:

@@ -65,7 +65,9 @@ def design(name: str) -> None:
         rows = parallel_map(partial(_export, *arguments, withhold=case.on_models), work, label, in_folder=True)
     except WithheldError as error:
         _withhold(folder, law, str(error))
-        print(f"design {name}: withheld; the results and the report say why", file=sys.stderr)
+        # Of the old loop neither speaks: it is no product.
+        why = str(error) if params.name == case.old_loop else "the results and the report say why"
+        print(f"design {name}: withheld; {why}", file=sys.stderr)
         return
     if case.old_loop not in ("", params.name):
         _export_old_loop(params, case, models, seeds, provenance)
