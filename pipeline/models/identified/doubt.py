@@ -45,11 +45,10 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
     """
     gain, pace, dead = np.zeros(n_mv), np.zeros(n_mv), np.zeros(n_mv)
     for j in range(n_mv):
-        strongest = int(np.abs(np.median(curves[:, j, -1], axis=0)).argmax())
-        found = curves[:, j, :, strongest]  # (members, length)
+        found = _strongest(curves[:, j])
         late = found[:, -max(found.shape[1] // 5, 1)]
         if np.mean(np.abs(found[:, -1] - late) > GOES_ON * np.abs(found[:, -1])) > OFTEN:
-            found = found[:, :MOST_PERIODS]
+            found = _strongest(curves[:, j, :MOST_PERIODS])  # another output may be moved most by then
         middle = float(np.median(found[:, -1]))
         if len(found) < 2 or middle == 0.0:
             continue
@@ -58,6 +57,11 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
         taken = rises[:, 1] - rises[:, 0]
         pace[j], dead[j] = spread(taken) / max(float(np.median(taken)), 1.0), spread(rises[:, 0])
     return Doubt(gain, np.array([pace.max()]), np.array([dead.max()]))
+
+
+def _strongest(curves: Array) -> Array:
+    """Of curves (members, length, n_y) those of the output (members, length) that is moved most at their end."""
+    return np.asarray(curves[..., int(np.abs(np.median(curves[:, -1], axis=0)).argmax())])
 
 
 def spread(values: Array) -> float:

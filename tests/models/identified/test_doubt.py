@@ -73,3 +73,15 @@ def test_drift_is_no_colour_beyond_what_the_residual_holds() -> None:
     walk = np.cumsum(np.random.default_rng(0).standard_normal((5000, 1)), axis=0)
     assert 0.9 < colour_of([walk])[0] <= MOST_COLOUR
     assert colour_of([np.zeros((50, 2))]).tolist() == [0.0, 0.0]
+
+
+def test_the_output_that_is_moved_most_is_sought_over_the_rows_that_count() -> None:
+    """A slow pole moves another output most in the end, by any size; over the first rows that one hardly answers."""
+    rng, k = np.random.default_rng(4), np.arange(300.0)
+    known = (1 - 0.9**k) * (1 + 0.05 * rng.normal(size=(16, 1)))
+    slow = 0.02 * k * rng.normal(1.0, 0.8, size=(16, 1))
+    late = np.clip(k - 60, 0, None) * slow + 0.01 * rng.normal(size=(16, 1)) * k / 60
+    found = doubt_of(np.stack([known + late / 50, late], axis=-1)[:, None], 1)
+    assert found.gain[0] < 0.1
+    assert found.pace[0] < 0.1
+    assert found.dead[0] < 1
