@@ -44,7 +44,7 @@ def closed(
     pipe = [u] * 4
     for k in range(n):
         y = x + noise[k]
-        if random.random() < 1 / 150 and (moves is None or k % (n // (moves + 1)) == 0):
+        if random.random() < 1 / 150 and moves is None:
             r = random.normal(0, 4)
         if moves and k and k % (n // (moves + 1)) == 0:
             r = 4.0 if r <= 0 else -4.0
