@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.errors import PlantError
 from pipeline.historian.pace import MOST_PERIODS
-from pipeline.plants.identified import IdentifiedPlant
+from pipeline.plants.identified import IdentifiedPlant, longest_memory
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.plants.spoilt import SpoiltPlant, likely_error
@@ -57,8 +57,11 @@ class OwnPlant(IdentifiedPlant):
 
     @property
     def foreseen(self) -> int:
-        """As far as predictive control looks ahead at most: of what comes later a record with loads says little."""
-        return MOST_PERIODS
+        """As far as predictive control looks ahead at most, after the dead time: later a record with loads says little.
+
+        Without it, an MV that acts after as many periods would seem not to act.
+        """
+        return MOST_PERIODS + longest_memory(self.arrays)
 
     @property
     def asked(self) -> tuple[Array, Array]:

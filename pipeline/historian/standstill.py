@@ -31,6 +31,7 @@ OFF, QUIET = 0.02, 0.05  # of a feed's usual value, and of its band: below both 
 PAD, FAR = 0.25, 1.0  # widths of a signal's band beyond it: away; far away
 BEYOND_MV = 2.0  # how much farther than the MVs, in widths of the band each: no answer goes so far
 ARRIVED, LONG = 0.1, 5.0  # of a PV's way: it has come to rest; and times the way, a rest that no test holds
+RETURNED = 0.25  # of how far a PV went in a rest: it is back so near to where it was before
 MOSTLY, STILL = 0.5, 0.8  # of a stop's rows: signals are away; MVs rest, where no end says that they do
 MOST_STOPS = 5  # of a feed: one that is off again and again is how the plant is run
 NAMED = 3  # stops whose times are named
@@ -104,7 +105,7 @@ def stops(
     if not (at_end or at_own or off):
         return [], []
     rests = _spread_over(len(time_s), [*at_end, *off])
-    whole = rests
+    whole = _with_return(rests, [value[t.tag] for t in pvs])
     for _ in range(2):  # the warm-up is where no signal works: the second time it is left out of the bands
         working = {tag: v[~whole] for tag, v in value.items()}
         plant = _Plant(
@@ -158,6 +159,20 @@ def _held(series: Series, at: Array) -> Array:
     good = series.good & ~np.isin(series.value, CODES)
     place = np.searchsorted(series.time_s[good], at, "right") - 1
     return series.value[good][np.maximum(place, 0)]
+
+
+def _with_return(rests: Where, pvs: Sequence[Array]) -> Where:
+    """The rests (n,), each until all PVs (n,) are back near where they were before it; the rests alone if that is much.
+
+    A slow warm-up is longer than its stop, and would count as where the plant works.
+    """
+    whole = rests.copy()
+    for first, last in zip(*runs_of(rests), strict=True):
+        for v in pvs if first else ():
+            away = np.abs(v - np.median(v[max(first - BACK, 0) : first]))
+            back = away[last:] <= RETURNED * away[first:last].max()
+            whole[last : last + int(back.argmax())] = True  # nothing of a PV that never comes back
+    return whole if whole.mean() <= MOST_SHARE else rests
 
 
 def _near(u: Array, ends: Sequence[float]) -> Where:

@@ -243,3 +243,12 @@ def shift_rows(arrays: StateEquation) -> NDArray[np.bool_]:
     table = np.concatenate([arrays.a, arrays.b], axis=1)
     copies = (np.count_nonzero(table, axis=1) == 1) & (table.max(axis=1) == 1) & (np.diag(arrays.a) == 0)
     return copies & (arrays.c == 0) & ~arrays.w2.any(axis=1)
+
+
+def longest_memory(arrays: StateEquation) -> int:
+    """Periods for which an input is only remembered, at most, before it acts: the longest chain of copies."""
+    chain, periods = arrays.a * shift_rows(arrays)[:, None], 0
+    reached = shift_rows(arrays)
+    while reached.any() and periods < len(reached):
+        reached, periods = (chain @ reached) > 0, periods + 1
+    return periods

@@ -16,10 +16,13 @@ from pipeline.cases.own_model import LEAST_GAIN, Doubts, OwnPlant
 from pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
 from pipeline.errors import ParamsError, PlantError
 from pipeline.historian.pace import MOST_PERIODS
+from pipeline.models.identified.assembly import remembering
+from pipeline.models.identified.dynamics import Dynamics
 from pipeline.plants.signals import Signals
 from pipeline.plants.spoilt import SpoiltPlant
 from pipeline.records.record import Record
 from pipeline.simulation.simulate import noise_draws, simulate_closed
+from pipeline.tuning.responses import StepResponses
 from serving.manifest import Signal
 
 TEMPERATURE = {"name": "TIC-101.PV", "unit": "degC", "low": 20.0, "high": 90.0}
@@ -178,6 +181,21 @@ def test_a_wrong_section_is_one_line(heater: OwnCase, tmp_path: Path, change: di
         own_case("heater")
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_an_mv_that_acts_after_many_periods_is_seen_to_act(heater: OwnCase) -> None:
+    plant = heater.plant
+    assert isinstance(plant, OwnPlant)
+    late = remembering(Dynamics(**{name: model(0.9)[name] for name in ("a", "b", "c", "w1", "b1", "w2")}), [70])
+    equation = {name: getattr(late, name) for name in ("a", "b", "c", "w1", "b1", "w2")}
+    of = OwnPlant(
+        plant.signals, replace(plant.arrays, **equation, rest=np.array([[1.0, 0.0, 0.0], *[[0.0, 1.0, 0.0]] * 70]))
+    )
+    of.noise, of.colour = plant.noise, plant.colour
+    assert of.foreseen == MOST_PERIODS + 70
+    process = StepResponses.near_start(of).process(0, 0)
+    assert process.dead_time_s == pytest.approx(700.0, rel=0.02)
+    assert process.rate * process.tau_s == pytest.approx(0.6, rel=0.02)
 
 
 def test_loops_are_tuned_for_what_the_record_visited_and_not_for_a_transmitters_range(heater: OwnCase) -> None:

@@ -139,6 +139,18 @@ def regulated(seed: int, first: int, last: int, valve: float) -> Clean:
     return Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(dv, 2))
 
 
+def test_a_stop_is_seen_beside_a_warm_up_that_is_longer(tmp_path: Path) -> None:
+    """Rows of the warm-up, a tenth of the record, are not where the plant works."""
+    random, n = np.random.default_rng(0), 4000
+    mv, dv = steps(random, n, 40, 50), 500 + random.normal(0, 5, n)
+    mv[2000:2400], mv[2400:2800] = 0.0, np.linspace(0.0, 45.0, 400)
+    pv = np.round(answer(mv, dv) + random.normal(0, 0.1, n), 3)
+    found = stopped(screen_of(Clean(START_S + PERIOD_S * np.arange(n), pv, mv, np.round(dv, 2)), tmp_path))
+    rows = np.flatnonzero(found)
+    assert abs(rows[0] - 2000) <= 3
+    assert 2650 < rows[-1] < 2850
+
+
 def test_a_shut_valve_for_long_is_a_stop_though_the_feed_goes_on(tmp_path: Path) -> None:
     found = screen_of(regulated(0, 2000, 2600, 0.0), tmp_path)
     rows = np.flatnonzero(stopped(found))
