@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -117,6 +118,14 @@ def test_the_error_at_rest_is_that_of_the_plant_where_it_stands() -> None:
     assert found["held_out"] == pytest.approx(sum(errors) / len(errors))
     assert found["load"] > 0
     assert set(found) == set(tests)
+
+
+def test_a_plant_that_runs_away_at_rest_has_no_error_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = controllers_of_a_lag({})
+    tests = dict(case.scenarios())
+    far = [replace(t, changes={name: 1e3 * load for name, load in t.changes.items()}) for t in tests["load"]]
+    monkeypatch.setattr(type(case), "scenarios", lambda _: {**tests, "load": far})
+    assert set(errors_at_rest(case)) == set(tests) - {"load"}
 
 
 def test_a_design_goes_by_the_numbers_of_the_old_loop_that_stands_beside_it() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.historian.pace import MOST_PERIODS
 from pipeline.models.identified.dynamics import Dynamics
 from pipeline.models.identified.rests import settle
 from pipeline.plants.simulator import Array
@@ -17,8 +18,8 @@ PLACES = 2000
 RESTS = 60
 """Constant inputs under which it must settle."""
 
-SLOWEST = 1e-3
-"""Distance of the growth a period from 1 within which differences neither fade nor grow: an integrator."""
+SLOWEST = 0.2 / MOST_PERIODS
+"""Distance of the growth a period from 1 of an integrator: as far as a law looks ahead, a fifth is gained or lost."""
 
 
 def stability_figures(model: Dynamics, states: Sequence[Array], inputs: Sequence[Array]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.historian.pace import MOST_PERIODS
 from pipeline.metrics import fit_percent
 from pipeline.models.identified.assembly import dead_periods, step_responses
 from pipeline.models.identified.doubt import spread
@@ -24,6 +25,9 @@ from serving.manifest import Signal
 
 QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Places of an input over its data at which the local gain is taken."""
+
+LATE = MOST_PERIODS // 5
+"""Last periods of an answer, over which the slope of an integrator's is taken."""
 
 SURE = 2.0
 """Standard deviations from zero beyond which a gain's sign is certain."""
@@ -152,7 +156,8 @@ def rests_of(model: Dynamics, data: ScaledRecord) -> tuple[Array, Array]:
 def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_], float]:
     """(local steady gains (n_v, quantiles, n_y), scaled; which of them are rates; the largest spectral radius there).
 
-    For an integrating output the slope of the response to a step, a period, stands in place of the gain: a rate.
+    For an integrating output the slope of the response to a step, a period, stands in place of the gain: a rate. It is
+    taken as far as a predictive law looks ahead: a pole beyond 1, which a record cannot tell from 1, bends it later on.
     """
     n_y, n_v = data.y.shape[1], data.v.shape[1]
     x, v = rests_of(model, data)
@@ -162,9 +167,10 @@ def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_]
         for q in range(len(QUANTILES)):
             at = j * len(QUANTILES) + q
             if radius[at] > INTEGRATES or not np.all(np.isfinite(gain[at])):
-                response = step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), 300)[j, :, :n_y] / 1e-3
-                rates[j, q] = np.abs(response[-1] - response[-31]) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
-                found[j, q] = np.where(rates[j, q], (response[-1] - response[-31]) / 30, response[-1])
+                response = step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), MOST_PERIODS)[j, :, :n_y] / 1e-3
+                slope = (response[-1] - response[-1 - LATE]) / LATE
+                rates[j, q] = np.abs(LATE * slope) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
+                found[j, q] = np.where(rates[j, q], slope, response[-1])
             else:
                 found[j, q] = gain[at, :n_y, j]
     return found, rates, float(radius.max())
