@@ -17,7 +17,7 @@ from pipeline.errors import PlantError, RecordError
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.grounds import RecordVerdict
 from pipeline.evaluation.model_evidence import Metrics, identified_part
-from pipeline.evaluation.one_side import on_one_side
+from pipeline.evaluation.one_side import before_turns, on_one_side
 from pipeline.files import read_json
 from pipeline.plants.identified import IdentifiedArrays
 from pipeline.plants.noise import deviation
@@ -27,6 +27,7 @@ from pipeline.records.record import Record
 from pipeline.records.set_points import SetPoints
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
+CURVE = 101  # values of an MV over its range at which the models' turns are sought
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
 
 
@@ -84,14 +85,18 @@ class OwnEnsemble(Case):
         return tuple(self._resting(self._member(path, self._model.start[1])) for path in paths)
 
     def _member(self, path: Path, mv: Array) -> OwnPlant:
-        """A model that begins at MVs (n_mv,)."""
+        """A model that begins at MVs (n_mv,), and takes those that laws may command."""
+        return self._over(self.commanded, path, mv)
+
+    def _over(self, signals: Signals, path: Path, mv: Array) -> OwnPlant:
+        """A model over the ranges of these signals."""
         with np.load(path, allow_pickle=False) as file:
             arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
             colour, doubts = np.asarray(file["colour"]), Doubts.of(file)
             noise = deviation(file["noise"] * file["y_scale"], colour)
         dv = np.median(self.record.dv, axis=0)
         most = int(np.ceil(max(doubts.dead, self._doubts.dead)))
-        plant = OwnPlant(self.commanded, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
+        plant = OwnPlant(signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
         plant.noise, plant.colour, plant.doubts = noise, colour, doubts
         return plant
 
@@ -134,9 +139,23 @@ class OwnEnsemble(Case):
 
     @cached_property
     def commanded(self) -> Signals:
-        """The signals of the laws: the MV ends where the record proves that its gain turns."""
-        median = float(visited_mv(self.record, self.signals.mv)[1][0])
-        return on_one_side(self.signals, self._figures.get("proof") or {}, median)
+        """The signals of the laws: the MV ends where the record proves that its gain turns, or a model of it turns."""
+        low, median, high = visited_mv(self.record, self.signals.mv)[:, 0]
+        found = on_one_side(self.signals, self._figures.get("proof") or {}, float(median))
+        if len(found.mv) != 1 or len(found.sp) != 1 or not self.ready:
+            return found
+        (mv,) = found.mv
+        values = np.linspace(mv.low, mv.high, CURVE)
+        curves = [self._curve(path, values) for path in (self._law_file, *sorted(self.models.glob(MEMBERS)))]
+        return before_turns(found, values, np.array(curves), (float(max(low, mv.low)), float(min(high, mv.high))))
+
+    def _curve(self, path: Path, values: Array) -> Array:
+        """What a model's CV (n,) reaches from its rest, as far as the answer is known, under values (n,) of its MV."""
+        plant = self._over(self.signals, path, visited_mv(self.record, self.signals.mv)[1])
+        x, advance = np.tile(plant.start[0], (len(values), 1)), plant.many(len(values))
+        for _ in range(plant.foreseen):
+            x = advance(x, values[:, None])
+        return np.asarray(plant.measured(x)[:, 0])
 
     @property
     def same_row(self) -> bool:

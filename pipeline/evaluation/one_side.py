@@ -10,9 +10,13 @@ from dataclasses import replace
 from itertools import takewhile
 from typing import Any
 
+import numpy as np
+
 from pipeline.plants.signals import Signals
+from pipeline.plants.simulator import Array
 
 LEAST = 0.1  # of the range that may be commanded, that a side must leave
+TURNS = 0.02  # of a curve's way, by which it comes back behind its turn: less is a curve that has become flat
 
 Regions = Sequence[Mapping[str, Any]]
 
@@ -32,6 +36,27 @@ def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Si
     low, high = (mv.low if low is None else max(low, mv.low)), (mv.high if high is None else min(high, mv.high))
     enough = high - low >= LEAST * (mv.high - mv.low)
     return replace(signals, mv=(replace(mv, low=low, high=high),)) if enough else signals
+
+
+def before_turns(signals: Signals, values: Array, curves: Array, visited: tuple[float, float]) -> Signals:
+    """The signals of a plant of one MV, whose range ends where a model of the record has its first turn.
+
+    ``curves`` (models, n) are what the models' CV reaches under rising values (n,) of the MV. What is ``visited``
+    (lowest, highest) remains: there the record judges, see ``on_one_side``. Outside of it nobody knows whether the
+    turn is the plant's, but a law on that model locks up behind it.
+    """
+    mv, (first, middle, last) = signals.mv[0], np.searchsorted(values, (visited[0], np.mean(visited), visited[1]))
+    rising = curves * np.sign(curves[:, [last]] - curves[:, [first]])
+    low = max([mv.low, *(values[middle - back] for back in _turns(-rising[:, middle::-1]))])
+    high = min([mv.high, *(values[middle + on] for on in _turns(rising[:, middle:]))])
+    return replace(signals, mv=(replace(mv, low=min(float(low), visited[0]), high=max(float(high), visited[1])),))
+
+
+def _turns(rising: Array) -> list[int]:
+    """Places of the tops of those curves (models, n) that come back behind them."""
+    tops = rising.argmax(axis=1)
+    back = np.array([curve[top] - curve[top:].min() for curve, top in zip(rising, tops, strict=True)])
+    return [int(top) for top in tops[back > TURNS * np.ptp(rising, axis=1)]]
 
 
 def side_of(regions: Regions, median: float) -> tuple[float | None, float | None]:

@@ -79,12 +79,12 @@ def _asked(evidence: Evidence) -> tuple[str, ...]:
 
 
 def _one_side(evidence: Evidence) -> tuple[str, ...]:
-    """The MVs that controllers move over a part of their ranges, because the gain turns its sign beyond it."""
+    """The MVs that controllers move over a part of their ranges, because a gain turns its sign beyond it."""
     case = evidence.case
     pairs = zip(case.plant_class.mv_signals, case.plant.mv_signals, strict=True) if case.on_models else ()
     return tuple(
         f"Controllers move {own.name} from {number(own.low)} to {number(own.high)} {own.unit}".rstrip(" -")
-        + " alone: beyond that the record proves a gain of the other sign, and a loop there would lock up."
+        + " alone: beyond that a model of the record has a gain of the other sign, and a loop there would lock up."
         for whole, own in pairs
         if (whole.low, whole.high) != (own.low, own.high)
     )

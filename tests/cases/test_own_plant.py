@@ -198,6 +198,19 @@ def test_an_mv_that_acts_after_many_periods_is_seen_to_act(heater: OwnCase) -> N
     assert process.rate * process.tau_s == pytest.approx(0.6, rel=0.02)
 
 
+def test_laws_stay_on_the_side_of_a_turn_that_one_of_the_models_has(heater: OwnCase) -> None:
+    """Of 2 tanh(1.5 v) - 1.5 v, which turns where cosh(1.5 v)^2 = 2, v = (u - 50) / 50: at 20.6 and 79.4 %."""
+    turning = {**model(0.9), "b": np.array([[-0.15]]), "w1": np.array([[0.0, 1.5]])}
+    turning |= {"b1": np.zeros(1), "w2": np.array([[0.2]])}
+    assert [(s.low, s.high) for s in heater.commanded.mv] == [(0.0, 100.0)]
+    np.savez(heater.models / "plant2.npz", **turning)
+    case = all_cases()["heater"]
+    assert isinstance(case, OwnCase)
+    (mv,) = case.commanded.mv
+    assert (mv.low, mv.high) == (pytest.approx(20.6, abs=1.0), pytest.approx(79.4, abs=1.0))
+    assert all(plant.mv_signals == (mv,) for plant in (case.plant, *case.members))
+
+
 def test_loops_are_tuned_for_what_the_record_visited_and_not_for_a_transmitters_range(heater: OwnCase) -> None:
     plant = heater.plant
     assert isinstance(plant, OwnPlant)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
-from pipeline.evaluation.one_side import on_one_side, side_of
+from pipeline.evaluation.one_side import before_turns, on_one_side, side_of
 from pipeline.plants.signals import Signals
 from serving.manifest import Signal
 
@@ -66,3 +67,18 @@ def test_a_narrower_range_that_a_person_gave_stays_and_no_side_of_it_means_no_ch
 def test_a_plant_of_several_mvs_keeps_its_ranges() -> None:
     several = Signals(10.0, (PV,), (PV,), (), (MV, Signal("w", "%", 0.0, 100.0)))
     assert on_one_side(several, {"answers": {"y": {"u": {"regions": HILL}}}}, 45.0) == several
+
+
+def test_an_mv_ends_at_the_first_turn_of_a_model_and_keeps_what_was_visited() -> None:
+    u = np.linspace(0.0, 100.0, 101)
+    rises, hill, valley = u, -((u - 70.0) ** 2), (u - 20.0) ** 2
+    flat, dips = np.minimum(u, 80.0) - 0.01 * np.maximum(u - 80.0, 0.0), u + 2.0 * np.exp(-((u - 62.0) ** 2))
+    for curves, ends in [
+        ([rises, hill, valley], (20.0, 70.0)),
+        ([-rises, -hill, -valley], (20.0, 70.0)),
+        ([rises, flat, dips], (0.0, 100.0)),
+        ([rises, -((u - 55.0) ** 2)], (0.0, 60.0)),
+        ([-((u - 70.0) ** 4)], (0.0, 70.0)),  # it falls farther behind its top than it rose before it
+    ]:
+        found = before_turns(ONE, u, np.array(curves), (30.0, 60.0)).mv[0]
+        assert (found.low, found.high) == ends
