@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ UNEXPLAINED = 0.3  # of the standard deviation of an integrator's change from bl
 HALF = 0.5  # of the rows, that are judged at least
 RESTS = 2  # settling times, after which a free run has come to the plant's level
 SPLITS = 40  # places tried for a jump
+SUDDEN, STANDS_OUT = 0.6, 3.0  # of a jump, within two blocks; and times what levels change over two blocks elsewhere
 RATIO = 0.08  # by which the answer must change with the jump, to be another span
 
 
@@ -129,36 +131,59 @@ def of_changes(name: str, y: Array, expected: Array, run: NDArray[np.int64]) -> 
     return [Finding("drift", name, words)]
 
 
-def _words(found: Levels) -> str:
-    level, curve, z, e, first, span = found.level, found.curve, found.z, found.expected, found.first, found.span
-    m = len(level)
-    time = np.linspace(-0.5, 0.5, m)
-    none = _left(curve, level)[0]
-    ramp, slope = _left(np.column_stack([curve, time]), level)
-    jumps = []
+class Jump(NamedTuple):
+    """A jump of levels: the row at which it is, its size, and by what share the answer changes with it."""
+
+    row: int
+    size: float
+    more: float
+    left: float  # sum of squares beside it
+
+
+def jump_of(found: Levels) -> Jump | None:
+    """The jump that leaves the least of the levels, from a little of them on.
+
+    None where it leaves more, or is not sudden: a load that wanders has a best one, too.
+    """
+    level, z, m, best = found.level, found.z, len(found.level), None
     for s in np.unique(np.linspace(2, m - 2, SPLITS).astype(np.int64)):
         after = (np.arange(m) >= s).astype(np.float64)
-        left, theta = _left(np.column_stack([curve, after, after * z]), level)
-        jumps.append((left, int(s), float(theta[-2]), float(theta[-1] / max(float(e.std()), 1e-300))))
-    left, s, jump, more = min(jumps)
+        x = np.column_stack([found.curve, after, after * z])
+        left, theta = _left(x, level)
+        if best is None or left < best[0].left:
+            more = float(theta[-1] / max(float(found.expected.std()), 1e-300))
+            jump = Jump(int(found.first[s]), float(theta[-2]), more, left)
+            best = jump, _is_sudden(level - x @ theta + theta[-2] * after, int(s), jump.size)
+    most = (1 - EXPLAINED) * _left(found.curve, level)[0]
+    return best[0] if best is not None and best[1] and best[0].left <= most else None
+
+
+def _words(found: Levels) -> str:
+    none = _left(found.curve, found.level)[0]
+    ramp, slope = _left(np.column_stack([found.curve, np.linspace(-0.5, 0.5, len(found.level))]), found.level)
+    jump = jump_of(found)
+    left = none if jump is None else jump.left
     if min(ramp, left) > (1 - EXPLAINED) * none:
         share = f"{found.percent:.0f} % of its usual span"  # more than 100 where the inputs held it against that
         return f"wanders: what the inputs do not explain moves over {share}; {WANDERING}"
-    if ramp < left + 0.05 * none:
+    if jump is None or ramp < left + 0.05 * none:
         change = float(slope[-1])
-        return (
-            f"drifts by {change:.4g} over the record, {100 * abs(change) / span:.0f} % of its span, without its inputs"
-        )
-    words = (
-        f"jumps by {jump:.4g} at row {int(first[s])}, {100 * abs(jump) / span:.0f} % of its span, without its inputs"
-    )
-    if abs(more) > RATIO:
-        words += (
-            f", and answers {1 + more:.2f} times as strongly from there on: a sensor's new span, or another product"
-        )
-    else:
-        words += ": a calibration, or another product"
-    return words
+        share = f"{100 * abs(change) / found.span:.0f} % of its span"
+        return f"drifts by {change:.4g} over the record, {share}, without its inputs"
+    share = f"{100 * abs(jump.size) / found.span:.0f} % of its span"
+    words = f"jumps by {jump.size:.4g} at row {jump.row}, {share}, without its inputs"
+    if abs(jump.more) > RATIO:
+        times = f"{1 + jump.more:.2f} times as strongly from there on"
+        return f"{words}, and answers {times}: a sensor's new span, or another product"
+    return f"{words}: a calibration, or another product"
+
+
+def _is_sudden(rest: Array, s: int, jump: float) -> bool:
+    """Whether most of a jump of levels (m,) lies within two blocks at about block s, and no other two change so."""
+    change = np.abs(rest[2:] - rest[:-2])
+    near = np.abs(np.arange(1, len(rest) - 1) - s) <= 1 + len(rest) // SPLITS
+    largest = float(change[near].max(initial=0.0))
+    return largest > SUDDEN * abs(jump) and largest > STANDS_OUT * float(np.sqrt(np.mean(change[~near] ** 2)))
 
 
 def _left(x: Array, target: Array) -> tuple[float, Array]:

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dirty_plant import PERIOD_S, Clean, clean, screen_of
+from scipy.signal import lfilter
 
 from pipeline.commands.new_printed import sayings
 from pipeline.historian.findings import InputReport
 from pipeline.historian.screening import Screened
+from pipeline.historian.wandering import Jump, jump_of, levels_of
 
 N = 4000
 ALONG = np.linspace(0.0, 1.0, N)
@@ -52,3 +54,20 @@ def test_a_drift_beside_a_slow_plant_makes_its_figures_unreliable(tmp_path: Path
 
 def test_a_slow_plant_without_a_drift_is_not_doubted(tmp_path: Path) -> None:
     assert screen_of(slow_plant(0 * ALONG), tmp_path).report.verdict.unsure == ()
+
+
+def test_a_load_that_wanders_is_no_jump_and_a_jump_beside_it_is_one() -> None:
+    """Of records of 3,000 rows, whose load returns within 1,000."""
+    random, found = np.random.default_rng(0), list[Jump | None]()
+    for _ in range(30):
+        explained = np.cumsum(random.random(3000) < 0.01) % 2 * 2.0 - 1
+        load = np.asarray(lfilter([np.sqrt(1 - 0.999**2)], [1, -0.999], random.normal(0, 1, 3000)), dtype=np.float64)
+        noise, row = random.normal(0, 0.1, 3000), int(random.integers(800, 2200))
+        for more in (0.7 * load, 0.15 * load + (np.arange(3000) > row)):
+            levels = levels_of(explained + more + noise, explained, 4.0, 60)
+            assert levels is not None
+            found.append(jump_of(levels))
+    assert found[::2].count(None) >= 26
+    jumps = [jump for jump in found[1::2] if jump is not None]
+    assert len(jumps) >= 29
+    assert np.median([jump.size for jump in jumps]) == pytest.approx(1.0, abs=0.1)
