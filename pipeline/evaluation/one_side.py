@@ -45,7 +45,7 @@ def before_turns(signals: Signals, values: Array, curves: Array, visited: tuple[
     (lowest, highest) remains: there the record judges, see ``on_one_side``. Outside of it nobody knows whether the
     turn is the plant's, but a law on that model locks up behind it.
     """
-    mv, (first, middle, last) = signals.mv[0], np.searchsorted(values, (visited[0], np.mean(visited), visited[1]))
+    mv, (first, middle, last) = signals.mv[0], np.searchsorted(values, [visited[0], 0.5 * sum(visited), visited[1]])
     rising = curves * np.sign(curves[:, [last]] - curves[:, [first]])
     low = max([mv.low, *(values[middle - back] for back in _turns(-rising[:, middle::-1]))])
     high = min([mv.high, *(values[middle + on] for on in _turns(rising[:, middle:]))])
