@@ -125,6 +125,32 @@ def filter_gain(a: Array, n_y: int, errors: float, loads: float) -> Array | None
     return np.asarray(p[:, :n_y] @ np.linalg.inv(p[:n_y, :n_y] + np.eye(n_y)))
 
 
+def forgetting(model: Innovations, covariance: Array) -> Innovations:
+    """The model whose filter forgets its start; as it is where it does, where it has units, or where none is found.
+
+    A free gain L may leave the filter, A - A L C, a pole z beyond 1, where a slow state of the plant and a load are
+    hard to tell apart: from fitted starts it foresees thousands of rows, and then runs away. Another gain L' has the
+    same spectrum with 1/z in its place, by the stabilizing solution P of
+
+        P = A P A' + A L R (A L)' - A L' S (A L')',   S = C P C' + R,   L' S = P C' + L R
+
+    with R the ``covariance`` (n_y, n_y) of the innovations.
+
+    Source: B. D. O. Anderson, J. B. Moore, Optimal filtering, 1979, section 9.3 (innovations representations).
+    """
+    n_y, a, gain, r = model.gain.shape[1], model.a, model.gain, covariance
+    c = np.eye(n_y, model.n_x)
+    if model.n_hidden or np.abs(np.linalg.eigvals(a - a @ gain @ c)).max() < 1:
+        return model
+    drive = a @ gain
+    try:
+        p = linalg.solve_discrete_are(a.T, c.T, drive @ r @ drive.T, r, s=drive @ r)
+    except (linalg.LinAlgError, ValueError):
+        return model
+    found = replace(model, gain=(p[:, :n_y] + gain @ r) @ np.linalg.inv(p[:n_y, :n_y] + r))
+    return found if np.abs(np.linalg.eigvals(a - a @ found.gain @ c)).max() < 1 else model
+
+
 def innovations(model: Dynamics, data: Sequence[Stretch]) -> Array | None:
     """One-step errors (n, n_y) over rows that count; None where the filter explodes.
 
@@ -247,8 +273,10 @@ class PredictionError:
             raise TypeError(type(found.model).__name__)
         unit = np.ones(model.n_x)
         unit[: len(size)] = unit[model.n_x - len(size) :] = size
-        model, starts = _about_mean_loads(found.model.rescaled(1 / size), [x * unit for x in found.starts], data)
-        return replace(found, model=model, starts=starts, trained=typical(innovations(model, data)))
+        inner = forgetting(found.model, (errors / size).T @ (errors / size) / len(errors))
+        held_out = found.held_out if inner is found.model else judge(inner)
+        model, starts = _about_mean_loads(inner.rescaled(1 / size), [x * unit for x in found.starts], data)
+        return replace(found, model=model, starts=starts, trained=typical(innovations(model, data)), held_out=held_out)
 
 
 def _about_mean_loads(

@@ -15,6 +15,7 @@ from pipeline.models.identified.innovations import (
     PredictionError,
     begun,
     filter_gain,
+    forgetting,
     innovations,
     load_moves,
     noise_of_filter,
@@ -152,6 +153,43 @@ def test_the_moves_of_the_loads_are_those_that_the_filter_sees() -> None:
     wild = replace(model, a=2 * model.a)
     assert innovations(wild, parts) is None
     assert load_moves(wild, parts).shape == (0, 2)
+
+
+@pytest.mark.parametrize("n_y", [1, 2])
+def test_a_filter_that_runs_away_gives_way_to_one_of_the_same_spectrum_that_forgets(n_y: int) -> None:
+    model = drawn(n_y)
+    c, eye = np.eye(n_y, model.n_x), np.eye(n_y)
+
+    def poles(of: Innovations) -> np.ndarray:
+        return np.asarray(np.abs(np.linalg.eigvals(of.a - of.a @ of.gain @ c)))
+
+    size = next(s for s in np.linspace(1, 40, 400) if poles(replace(model, gain=s * model.gain)).max() > 1.02)
+    wild, covariance = replace(model, gain=size * model.gain), eye + 0.3 * (1 - eye)
+    calm = forgetting(wild, covariance)
+    before = poles(wild)
+    assert np.sort(poles(calm)) == pytest.approx(np.sort(np.minimum(before, 1 / before)))
+
+    def shaped(of: Innovations, at: complex) -> np.ndarray:
+        return np.eye(n_y) + c @ np.linalg.solve(at * np.eye(of.n_x) - of.a, of.a @ of.gain)
+
+    seen = []
+    for angle in (0.1, 0.7, 1.9, 3.0):
+        at = np.exp(1j * angle)
+        ratio = np.linalg.solve(shaped(calm, at), shaped(wild, at))
+        seen.append(ratio @ covariance @ ratio.conj().T)
+    assert np.array(seen) == pytest.approx(np.broadcast_to(seen[0].real, (4, n_y, n_y)), abs=1e-8)
+    assert np.linalg.det(seen[0].real) > np.linalg.det(covariance)
+    assert forgetting(calm, covariance) is calm
+
+
+def test_a_fit_ends_in_a_filter_that_forgets() -> None:
+    model, c = drawn(1), np.eye(1, 4)
+    gains = (replace(model, gain=size * model.gain) for size in np.linspace(1, 40, 4000))
+    wild = next(of for of in gains if np.abs(np.linalg.eigvals(of.a - of.a @ of.gain @ c)).max() > 1)
+    fitted = PredictionError(iterations=0).fit(wild, [rows(model)], [rows(model, seed=2)])
+    assert isinstance(fitted.model, Innovations)
+    assert np.abs(np.linalg.eigvals(fitted.model.a - fitted.model.a @ fitted.model.gain @ c)).max() < 1
+    assert fitted.held_out == pytest.approx(typical(innovations(fitted.model, [rows(model, seed=2)])), rel=0.1)
 
 
 def test_slow_outputs_count_as_much_as_fast_ones() -> None:
