@@ -50,8 +50,8 @@ def fit_starts(
     """
     nothing = np.zeros(len(model.vector()), dtype=bool)
     found = []
-    for i, stretch in enumerate(data):
-        guesses = _guesses(model, stretch) if starts is None else [starts[i]]
+    tried = _guesses(model, data) if starts is None else [[x] for x in starts]
+    for stretch, guesses in zip(data, tried, strict=True):
         errors = [squares(model, [x], [stretch], correction) for x in guesses]
         best, x0 = min(errors), guesses[int(np.argmin(errors))]
         for _ in range(iterations if np.isfinite(best) else 0):
@@ -74,15 +74,19 @@ def fit_starts(
     return found
 
 
-def _guesses(model: Dynamics, stretch: Stretch, periods: int = 100) -> list[Array]:
-    """Initial states (n_x,) with the first outputs: hidden states at zero, and settled under the first inputs."""
-    n_y = stretch.y.shape[1]
-    x = zero = np.r_[stretch.y[0], np.zeros(model.n_x - n_y)]
+def _guesses(model: Dynamics, data: Sequence[Stretch], periods: int = 100) -> list[list[Array]]:
+    """Initial states (n_x,) of each stretch with its first outputs: hidden states zero, and settled under its input."""
+    n_y = data[0].y.shape[1]
+    first = np.array([s.y[0] for s in data])
+    zero = np.hstack([first, np.zeros((len(data), model.n_x - n_y))])
+    # A product for each stretch, side by side: one of all would round them otherwise.
+    x, v = zero[:, None, :], np.array([s.v[0] for s in data])[:, None, :]
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(periods):
-            x = model.advance(x, stretch.v[0])
-    settled = np.r_[stretch.y[0], x[n_y:]]
-    return [zero, settled] if np.all(np.abs(settled) < EXPLODED) else [zero]
+            x = model.advance(x, v)
+    settled = np.hstack([first, x[:, 0, n_y:]])
+    kept = np.all(np.abs(settled) < EXPLODED, axis=1)
+    return [[a, b] if within else [a] for a, b, within in zip(zero, settled, kept, strict=True)]
 
 
 def free_run_error(

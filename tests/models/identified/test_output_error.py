@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import linalg
 
 from pipeline.models.identified import dynamics, sensitivities
 from pipeline.models.identified.dynamics import Dynamics, Stretch
@@ -19,7 +20,7 @@ from pipeline.models.identified.output_error import (
     residuals,
     squares,
 )
-from pipeline.models.identified.sensitivities import CHUNK, sensitivity_sums
+from pipeline.models.identified.sensitivities import CHUNK, Equations, sensitivity_sums
 
 
 def drawn(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:
@@ -84,6 +85,44 @@ def test_the_gradient_is_that_of_the_free_run(
     assert -2 * float(sums.of_starts[1][2] @ move) == pytest.approx(
         (moved[0] - moved[1]) / (2 * step), rel=1e-4, abs=1e-4
     )
+
+
+@pytest.mark.parametrize(("n_y", "n_v", "n_hidden"), [(1, 1, 0), (2, 3, 5)])
+def test_starts_of_many_stretches_are_those_of_each_to_the_bit(n_y: int, n_v: int, n_hidden: int) -> None:
+    model = contracting(n_y, n_v, n_y + 3, n_hidden, 4)
+    data = [stretch(model, n_y, 20 + k, k, 0.3) for k in range(9)]
+    for one, start in zip(data, fit_starts(model, data, iterations=0), strict=True):
+        x = zero = np.r_[one.y[0], np.zeros(3)]
+        for _ in range(100):
+            x = model.advance(x, one.v[0])
+        settled = np.r_[one.y[0], x[n_y:]]
+        assert np.array_equal(start, min(zero, settled, key=lambda x: squares(model, [x], [one])))
+    together = fit_starts(model, data, 0.1)
+    assert all(np.array_equal(x, fit_starts(model, [one], 0.1)[0]) for x, one in zip(together, data, strict=True))
+
+
+@pytest.mark.parametrize("parameters", [True, False])
+def test_the_step_is_that_of_plain_cholesky_factors_to_the_bit(parameters: bool) -> None:
+    model = drawn(1, 1, 3, 2, 3)
+    data = [stretch(model, 1, 30, k, 0.3) for k in range(4)]
+    free = np.full(len(model.vector()), parameters)
+    sums = sensitivity_sums(model, [np.zeros(3)] * 4, data, free, 0.0)
+    assert sums is not None
+    h, g, parts = sums.h + 0.1 * np.eye(len(sums.h)), sums.g, []
+    for cross, own, right in sums.of_starts:
+        factor = linalg.cho_factor(own + 0.02 * np.eye(3))
+        parts.append((linalg.cho_solve(factor, cross.T), linalg.cho_solve(factor, right)))
+        h, g = h - cross @ parts[-1][0], g - cross @ parts[-1][1]
+    wanted = linalg.solve(h, g, assume_a="pos") if parameters else g
+    step, moves = sums.solve(0.1, 0.02)
+    assert np.array_equal(step, wanted)
+    assert all(np.array_equal(move, mean - back @ wanted) for move, (back, mean) in zip(moves, parts, strict=True))
+
+
+def test_a_start_without_a_least_error_is_no_step() -> None:
+    sums = Equations(np.zeros((0, 0)), np.zeros(0), [(np.zeros((0, 2)), -np.eye(2), np.ones(2))])
+    with pytest.raises(np.linalg.LinAlgError):
+        sums.solve(0.0, 1e-9)
 
 
 def test_the_step_solves_the_whole_system() -> None:
