@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Self
 
@@ -116,11 +117,20 @@ class Dynamics(StateEquation):
 
         With ``correction`` 0 the two are the same, and y is not used; with 1 the outputs are predicted one step ahead.
         """
+        return self.runner(correction)(start, data)
+
+    def runner(self, correction: float = 0.0) -> Callable[[Array, Stretch], tuple[Array, Array] | None]:
+        """``free_run`` of (start, data), for many of them: what they share is made once."""
         n_x = self.n_x
         matrix = np.ascontiguousarray(np.concatenate([self.a, self.w1[:, :n_x]]))
-        drive = np.concatenate([data.v @ self.b.T + self.c, data.v @ self.w1[:, n_x:].T + self.b1], axis=1)
-        before, after = np.empty((len(data), n_x)), np.empty((len(data), n_x))
-        y, x = np.ascontiguousarray(data.y), np.asarray(start, dtype=np.float64)
         w2, gain = np.ascontiguousarray(self.w2), np.ascontiguousarray(self.filter_gain)
-        kept = run_rows(matrix, w2, drive, y, correction, gain, x, EXPLODED, before, after)
-        return (before, after) if kept else None
+        b, w1 = self.b.T, self.w1[:, n_x:].T
+
+        def run(start: Array, data: Stretch) -> tuple[Array, Array] | None:
+            drive = np.concatenate([data.v @ b + self.c, data.v @ w1 + self.b1], axis=1)
+            before, after = np.empty((len(data), n_x)), np.empty((len(data), n_x))
+            y, x = np.ascontiguousarray(data.y), np.asarray(start, dtype=np.float64)
+            kept = run_rows(matrix, w2, drive, y, correction, gain, x, EXPLODED, before, after)
+            return (before, after) if kept else None
+
+        return run

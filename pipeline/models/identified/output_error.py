@@ -21,9 +21,9 @@ def residuals(
     model: Dynamics, starts: Sequence[Array], data: Sequence[Stretch], correction: float = 0.0
 ) -> list[Array] | None:
     """Residuals y - y_hat (n, n_y) of each stretch; None where a free run explodes."""
-    found = []
+    found, free_run = [], model.runner(correction)
     for start, stretch in zip(starts, data, strict=True):
-        run = model.free_run(start, stretch, correction)
+        run = free_run(start, stretch)
         if run is None:
             return None
         found.append(stretch.y - run[0][:, : stretch.y.shape[1]])

@@ -70,9 +70,9 @@ def sensitivity_sums(
     columns = np.concatenate([free, np.ones(n_x, dtype=bool)])
     # Another layout in memory would be compiled anew, which takes seconds.
     a, w1, w2 = (np.ascontiguousarray(matrix) for matrix in (model.a, model.w1, model.w2))
-    gain = np.ascontiguousarray(model.filter_gain)
+    gain, free_run = np.ascontiguousarray(model.filter_gain), model.runner(correction)
     for start, stretch in zip(starts, data, strict=True):
-        run = model.free_run(start, stretch, correction)
+        run = free_run(start, stretch)
         if run is None:
             return None
         predicted, from_states = run
@@ -97,7 +97,7 @@ def sensitivity_sums(
                 blocks.append(jac.T @ missed.ravel())
         if not np.all(np.isfinite(own)):
             return None
-        right = np.sum(blocks, axis=0)
+        right = np.sum(blocks, axis=0) if len(blocks) > 1 else blocks[0]
         sums.h += own[:n_free, :n_free]
         sums.g += right[:n_free]
         sums.of_blocks.extend(blocks)
