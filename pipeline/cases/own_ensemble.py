@@ -25,6 +25,7 @@ from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.records.record import Record
 from pipeline.records.set_points import SetPoints
+from pipeline.simulation.rests import courses
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 CURVE = 101  # values of an MV over its range at which the models' turns are sought
@@ -152,10 +153,9 @@ class OwnEnsemble(Case):
     def _curve(self, path: Path, values: Array) -> Array:
         """What a model's CV (n,) reaches from its rest, as far as the answer is known, under values (n,) of its MV."""
         plant = self._over(self.signals, path, visited_mv(self.record, self.signals.mv)[1])
-        x, advance = np.tile(plant.start[0], (len(values), 1)), plant.many(len(values))
-        for _ in range(plant.foreseen):
-            x = advance(x, values[:, None])
-        return np.asarray(plant.measured(x)[:, 0])
+        (signal,), ends = plant.sp_signals, courses(plant, plant.start[0], values[:, None], plant.foreseen)[:, -1, 0]
+        span = signal.high - signal.low
+        return np.asarray(np.clip(ends, signal.low - span, signal.high + span))  # no record knows of curves out there
 
     @property
     def same_row(self) -> bool:

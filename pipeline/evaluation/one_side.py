@@ -34,8 +34,7 @@ def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Si
     found = ((proof.get("answers") or {}).get(signals.sp[0].name) or {}).get(mv.name) or {}
     low, high = side_of(found.get("regions") or (), median)
     low, high = (mv.low if low is None else max(low, mv.low)), (mv.high if high is None else min(high, mv.high))
-    enough = high - low >= LEAST * (mv.high - mv.low)
-    return replace(signals, mv=(replace(mv, low=low, high=high),)) if enough else signals
+    return _within(signals, low, high)
 
 
 def before_turns(signals: Signals, values: Array, curves: Array, visited: tuple[float, float]) -> Signals:
@@ -46,17 +45,30 @@ def before_turns(signals: Signals, values: Array, curves: Array, visited: tuple[
     turn is the plant's, but a law on that model locks up behind it.
     """
     mv, (first, middle, last) = signals.mv[0], np.searchsorted(values, [visited[0], 0.5 * sum(visited), visited[1]])
+    first, last = max(min(first, middle - 1), 0), min(max(last, middle + 1), len(values) - 1)
     rising = curves * np.sign(curves[:, [last]] - curves[:, [first]])
-    low = max([mv.low, *(values[middle - back] for back in _turns(-rising[:, middle::-1]))])
-    high = min([mv.high, *(values[middle + on] for on in _turns(rising[:, middle:]))])
-    return replace(signals, mv=(replace(mv, low=min(float(low), visited[0]), high=max(float(high), visited[1])),))
+    least = TURNS * np.ptp(curves, axis=1)
+    low = max([mv.low, *(values[middle - back] for back in _turns(-rising[:, middle::-1], least))])
+    high = min([mv.high, *(values[middle + on] for on in _turns(rising[:, middle:], least))])
+    return _within(signals, min(float(low), visited[0]), max(float(high), visited[1]))
 
 
-def _turns(rising: Array) -> list[int]:
-    """Places of the tops of those curves (models, n) that come back behind them."""
-    tops = rising.argmax(axis=1)
-    back = np.array([curve[top] - curve[top:].min() for curve, top in zip(rising, tops, strict=True)])
-    return [int(top) for top in tops[back > TURNS * np.ptp(rising, axis=1)]]
+def _turns(rising: Array, least: Array) -> list[int]:
+    """Places of the first tops behind which curves (models, n) come back by more than ``least`` (models,)."""
+    found = []
+    for curve, enough in zip(rising, least, strict=True):
+        lost = np.maximum.accumulate(curve) - curve > enough
+        if lost.any():
+            found.append(int(curve[: lost.argmax()].argmax()))
+    return found
+
+
+def _within(signals: Signals, low: float, high: float) -> Signals:
+    """The signals with the MV's range from low to high, unless less than ``LEAST`` of it is left."""
+    mv = signals.mv[0]
+    return (
+        replace(signals, mv=(replace(mv, low=low, high=high),)) if high - low >= LEAST * (mv.high - mv.low) else signals
+    )
 
 
 def side_of(regions: Regions, median: float) -> tuple[float | None, float | None]:

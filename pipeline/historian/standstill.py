@@ -162,15 +162,17 @@ def _held(series: Series, at: Array) -> Array:
 
 
 def _with_return(rests: Where, pvs: Sequence[Array]) -> Where:
-    """The rests (n,), each until all PVs (n,) are back near where they were before it; the rests alone if that is much.
+    """The rests (n,), each until all PVs (n,) are back near where they were; the rests alone if that is ``MOST_SHARE``.
 
     A slow warm-up is longer than its stop, and would count as where the plant works.
     """
     whole = rests.copy()
     for first, last in zip(*runs_of(rests), strict=True):
-        for v in pvs if first else ():
+        if first == 0:  # nobody knows where the PVs were before
+            continue
+        for v in pvs:
             away = np.abs(v - np.median(v[max(first - BACK, 0) : first]))
-            back = away[last:] <= RETURNED * away[first:last].max()
+            back = np.r_[away[last:] <= RETURNED * away[first:last].max(), False]
             whole[last : last + int(back.argmax())] = True  # nothing of a PV that never comes back
     return whole if whole.mean() <= MOST_SHARE else rests
 
@@ -273,5 +275,5 @@ def _with_warm_up(plant: _Plant, rows: Rows) -> Rows:
     inside, wide = np.all([b == 0 for b in beyond], axis=0), np.all([b <= PAD for b in beyond], axis=0)
     while first > 0 and not wide[first - 1]:
         first -= 1
-    run = np.convolve(inside[last:], np.ones(BACK), "valid") == BACK
+    run = np.convolve(np.r_[inside[last:], np.zeros(BACK)], np.ones(BACK), "valid") == BACK
     return first, last + int(np.argmax(run)) if run.any() else n

@@ -29,7 +29,8 @@ UNEXPLAINED = 0.3  # of the standard deviation of an integrator's change from bl
 HALF = 0.5  # of the rows, that are judged at least
 RESTS = 2  # settling times, after which a free run has come to the plant's level
 SPLITS = 40  # places tried for a jump
-SUDDEN, STANDS_OUT = 0.6, 3.0  # of a jump, within two blocks; and times what levels change over two blocks elsewhere
+SUDDEN = 0.6  # of a jump, within two blocks
+STANDS_OUT, MOST_BLOCKS = 2.5, 0.75  # times what levels change over two blocks elsewhere, but for another jump
 RATIO = 0.08  # by which the answer must change with the jump, to be another span
 
 
@@ -153,9 +154,11 @@ def jump_of(found: Levels) -> Jump | None:
         if best is None or left < best[0].left:
             more = float(theta[-1] / max(float(found.expected.std()), 1e-300))
             jump = Jump(int(found.first[s]), float(theta[-2]), more, left)
-            best = jump, _is_sudden(level - x @ theta + theta[-2] * after, int(s), jump.size)
-    most = (1 - EXPLAINED) * _left(found.curve, level)[0]
-    return best[0] if best is not None and best[1] and best[0].left <= most else None
+            best = jump, level - x @ theta + theta[-2] * after, int(s)
+    if best is None or best[0].left > (1 - EXPLAINED) * _left(found.curve, level)[0]:
+        return None
+    jump, rest, at = best
+    return jump if _is_sudden(rest, at, jump.size) else None
 
 
 def _words(found: Levels) -> str:
@@ -183,7 +186,7 @@ def _is_sudden(rest: Array, s: int, jump: float) -> bool:
     change = np.abs(rest[2:] - rest[:-2])
     near = np.abs(np.arange(1, len(rest) - 1) - s) <= 1 + len(rest) // SPLITS
     largest = float(change[near].max(initial=0.0))
-    return largest > SUDDEN * abs(jump) and largest > STANDS_OUT * float(np.sqrt(np.mean(change[~near] ** 2)))
+    return largest > SUDDEN * abs(jump) and largest > STANDS_OUT * float(np.quantile(change[~near], MOST_BLOCKS))
 
 
 def _left(x: Array, target: Array) -> tuple[float, Array]:

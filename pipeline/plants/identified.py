@@ -246,7 +246,7 @@ def shift_rows(arrays: StateEquation) -> NDArray[np.bool_]:
 
 
 def longest_memory(arrays: StateEquation) -> int:
-    """Periods for which an input is only remembered, at most, before it acts: the longest chain of copies."""
+    """Periods that the longest chain of copies remembers: no less than any dead time, and the lags of a difference."""
     chain, periods = arrays.a * shift_rows(arrays)[:, None], 0
     reached = shift_rows(arrays)
     while reached.any() and periods < len(reached):

@@ -35,7 +35,8 @@ class StepResponses:
     """Changes of each controlled variable after a step of each MV, near the start of a plant.
 
     ``y[i, j, k]`` [pv/mv]: of CV i, k + 1 periods after a unit step of MV j. ``slope[i, j]`` [pv/mv a period]: of
-    its last fifth, 0 where it has settled, or creeps on by little beside what it did before.
+    its last fifth, 0 where it has settled, or creeps on by little beside what it did before. It is 0 of a CV whose
+    answer to the MV that moves it most, over the MVs' ranges, comes to rest.
     """
 
     y: Array  # (n_cv, n_mv, n)
@@ -72,8 +73,10 @@ class StepResponses:
             slope = _slopes(y)
             if n >= longest or _known(y, slope):
                 spans = (np.array([s.high - s.low for s in plant.sp_signals]), high - low)
-                ramp = np.abs(slope[-1]) * n >= RAMP * np.abs(y).max(axis=-1)
-                return cls(y, np.where(ramp & ~_settled(y), slope[-1], 0.0), plant.period_s, spans)
+                ramp = (np.abs(slope[-1]) * n >= RAMP * np.abs(y).max(axis=-1)) & ~_settled(y)
+                strongest = np.abs(y[..., -1] * spans[1]).argmax(axis=1)
+                integrates = np.take_along_axis(ramp, strongest[:, None], axis=1)
+                return cls(y, np.where(ramp & integrates, slope[-1], 0.0), plant.period_s, spans)
             n *= 2
 
     @property

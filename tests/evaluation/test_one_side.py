@@ -79,6 +79,11 @@ def test_an_mv_ends_at_the_first_turn_of_a_model_and_keeps_what_was_visited() ->
         ([rises, flat, dips], (0.0, 100.0)),
         ([rises, -((u - 55.0) ** 2)], (0.0, 60.0)),
         ([-((u - 70.0) ** 4)], (0.0, 70.0)),  # it falls farther behind its top than it rose before it
+        ([np.interp(u, [0, 60, 80, 100], [0, 60, 20, 70])], (0.0, 60.0)),  # the first turn
     ]:
         found = before_turns(ONE, u, np.array(curves), (30.0, 60.0)).mv[0]
         assert (found.low, found.high) == ends
+    for visited, ends in [((75.0, 95.0), (0.0, 100.0)), ((0.0, 100.0), (0.0, 100.0))]:  # flat is flat from anywhere
+        found = before_turns(ONE, u, np.array([flat]), visited).mv[0]
+        assert (found.low, found.high) == ends
+    assert before_turns(ONE, u, np.array([hill]), (50.2, 50.2)).mv[0].high == 70.0  # an MV that rested

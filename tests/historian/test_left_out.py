@@ -151,6 +151,11 @@ def test_a_stop_is_seen_beside_a_warm_up_that_is_longer(tmp_path: Path) -> None:
     assert 2650 < rows[-1] < 2850
 
 
+def test_a_record_may_end_in_a_stop(tmp_path: Path) -> None:
+    rows = np.flatnonzero(stopped(screen_of(regulated(0, 3400, 4000, 0.0), tmp_path)))
+    assert (abs(rows[0] - 3400) <= 3, rows[-1]) == (True, 3999)
+
+
 def test_a_shut_valve_for_long_is_a_stop_though_the_feed_goes_on(tmp_path: Path) -> None:
     found = screen_of(regulated(0, 2000, 2600, 0.0), tmp_path)
     rows = np.flatnonzero(stopped(found))

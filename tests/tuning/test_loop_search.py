@@ -133,6 +133,17 @@ def test_an_answer_counts_as_far_as_it_is_known(monkeypatch: pytest.MonkeyPatch)
     assert found.gain[0, 0] == pytest.approx(1 - 0.95**60 - 1.5 * (1 - 0.998**60), rel=0.01)
 
 
+def test_a_weak_answer_that_goes_on_makes_no_integrator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a 3x3 each controlled variable crept on under one weak MV: by these rates alone no loops were independent."""
+    monkeypatch.setattr(Sampled, "foreseen", property(lambda self: 60))
+    fast, slow = np.array([0.9, 0.9]), np.array([0.9995, 0.9995])
+    drive = [[0.1, 0.0], [0.0, 0.1], [0.0, 0.0005], [0.0005, 0.0]]
+    found = StepResponses.near_start(Sampled(np.diag([*fast, *slow]), drive, np.hstack([np.eye(2), 3 * np.eye(2)])))
+    assert not found.integrates.any()
+    assert found.gain == pytest.approx(np.array([[1.0, 0.09], [0.09, 1.0]]), abs=0.01)
+    assert [pairs for pairs, _ in pairings(found.gain)] == [((0, 0), (1, 1))]
+
+
 def test_an_integrator_is_crossed_by_its_strongest_mv() -> None:
     found = StepResponses.near_start(tank())
     width = found.spans[1] * 0.05 * 10

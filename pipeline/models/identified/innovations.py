@@ -18,7 +18,7 @@ from scipy import linalg
 
 from pipeline.errors import ModelError
 from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.output_error import Fitted, OutputError
+from pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
 from pipeline.plants.simulator import Array
 
 LOADS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -33,6 +33,9 @@ LEAST, MOST = 20, 300
 
 AHEAD = 30
 """Rows that figures of a model with its noise are predicted ahead, at most: about as far as a controller looks."""
+
+ALIKE = 1e-6
+"""Of the innovations' variance, that two outputs do not share."""
 
 LEAST_NOISE = 0.01
 """Share of an innovation's variance that is at least measurement noise."""
@@ -138,16 +141,17 @@ def forgetting(model: Innovations, covariance: Array) -> Innovations:
 
     Source: B. D. O. Anderson, J. B. Moore, Optimal filtering, 1979, section 9.3 (innovations representations).
     """
-    n_y, a, gain, r = model.gain.shape[1], model.a, model.gain, covariance
+    n_y, a, gain = model.gain.shape[1], model.a, model.gain
+    r = covariance + ALIKE * np.trace(covariance) * np.eye(n_y)  # outputs may be copies of each other
     c = np.eye(n_y, model.n_x)
     if model.n_hidden or np.abs(np.linalg.eigvals(a - a @ gain @ c)).max() < 1:
         return model
     drive = a @ gain
     try:
         p = linalg.solve_discrete_are(a.T, c.T, drive @ r @ drive.T, r, s=drive @ r)
+        found = replace(model, gain=(p[:, :n_y] + gain @ r) @ np.linalg.inv(p[:n_y, :n_y] + r))
     except (linalg.LinAlgError, ValueError):
         return model
-    found = replace(model, gain=(p[:, :n_y] + gain @ r) @ np.linalg.inv(p[:n_y, :n_y] + r))
     return found if np.abs(np.linalg.eigvals(a - a @ found.gain @ c)).max() < 1 else model
 
 
@@ -273,9 +277,11 @@ class PredictionError:
             raise TypeError(type(found.model).__name__)
         unit = np.ones(model.n_x)
         unit[: len(size)] = unit[model.n_x - len(size) :] = size
-        inner = forgetting(found.model, (errors / size).T @ (errors / size) / len(errors))
-        held_out = found.held_out if inner is found.model else judge(inner)
-        model, starts = _about_mean_loads(inner.rescaled(1 / size), [x * unit for x in found.starts], data)
+        left = np.concatenate(residuals(found.model, found.starts, train) or [errors / size])
+        inner, starts, held_out = forgetting(found.model, left.T @ left / len(left)), found.starts, found.held_out
+        if inner is not found.model:
+            starts, held_out = fit_starts(inner, train), judge(inner)
+        model, starts = _about_mean_loads(inner.rescaled(1 / size), [x * unit for x in starts], data)
         return replace(found, model=model, starts=starts, trained=typical(innovations(model, data)), held_out=held_out)
 
 

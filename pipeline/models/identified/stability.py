@@ -40,7 +40,7 @@ def stability_figures(model: Dynamics, states: Sequence[Array], inputs: Sequence
     integrates = abs(growth - 1) < SLOWEST and settles < 1
     stable = integrates or (growth < 1 and settles == 1)
     if integrates:
-        words = "integrates: differences between two runs neither fade nor grow"
+        words = "integrates: differences between two runs hardly fade or grow as far as a law looks ahead"
     elif stable:
         words = "stable: it settles under every constant input of the record, and nearby runs approach each other"
     elif growth > 1:

@@ -15,7 +15,7 @@ from pipeline.models.identified.doubt import spread
 from pipeline.models.identified.dynamics import Dynamics, Stretch
 from pipeline.models.identified.innovations import AHEAD, Innovations, ahead
 from pipeline.models.identified.output_error import fit_starts
-from pipeline.models.identified.rests import INTEGRATES, central_map, middle_rest, settle, steady_gain
+from pipeline.models.identified.rests import INTEGRATES, LONG, central_map, middle_rest, settle, steady_gain
 from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.models.identified.selection import Selection
 from pipeline.models.identified.structure import Problem
@@ -26,8 +26,8 @@ from serving.manifest import Signal
 QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Places of an input over its data at which the local gain is taken."""
 
-LATE = MOST_PERIODS // 5
-"""Last periods of an answer, over which the slope of an integrator's is taken."""
+LATE, BENT = 30, 1.2
+"""Last periods of an answer, over which the slope of an integrator's is taken, and growth that bends it too far."""
 
 SURE = 2.0
 """Standard deviations from zero beyond which a gain's sign is certain."""
@@ -157,7 +157,7 @@ def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_]
     """(local steady gains (n_v, quantiles, n_y), scaled; which of them are rates; the largest spectral radius there).
 
     For an integrating output the slope of the response to a step, a period, stands in place of the gain: a rate. It is
-    taken as far as a predictive law looks ahead: a pole beyond 1, which a record cannot tell from 1, bends it later on.
+    taken over the last rows, of a pole beyond 1, which a record cannot tell from 1, before that bends it by ``BENT``.
     """
     n_y, n_v = data.y.shape[1], data.v.shape[1]
     x, v = rests_of(model, data)
@@ -167,10 +167,10 @@ def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_]
         for q in range(len(QUANTILES)):
             at = j * len(QUANTILES) + q
             if radius[at] > INTEGRATES or not np.all(np.isfinite(gain[at])):
-                response = step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), MOST_PERIODS)[j, :, :n_y] / 1e-3
-                slope = (response[-1] - response[-1 - LATE]) / LATE
-                rates[j, q] = np.abs(LATE * slope) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
-                found[j, q] = np.where(rates[j, q], slope, response[-1])
+                response = step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), LONG)[j, :, :n_y] / 1e-3
+                rates[j, q] = np.abs(response[-1] - response[-1 - LATE]) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
+                end = int(np.clip(np.log(BENT) / np.log(max(radius[at], 1 + 1e-9)), MOST_PERIODS, LONG)) - 1
+                found[j, q] = np.where(rates[j, q], (response[end] - response[end - LATE]) / LATE, response[-1])
             else:
                 found[j, q] = gain[at, :n_y, j]
     return found, rates, float(radius.max())

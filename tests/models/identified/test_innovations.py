@@ -177,7 +177,7 @@ def test_a_filter_that_runs_away_gives_way_to_one_of_the_same_spectrum_that_forg
         at = np.exp(1j * angle)
         ratio = np.linalg.solve(shaped(calm, at), shaped(wild, at))
         seen.append(ratio @ covariance @ ratio.conj().T)
-    assert np.array(seen) == pytest.approx(np.broadcast_to(seen[0].real, (4, n_y, n_y)), abs=1e-8)
+    assert np.array(seen) == pytest.approx(np.broadcast_to(seen[0].real, (4, n_y, n_y)), abs=1e-6)
     assert np.linalg.det(seen[0].real) > np.linalg.det(covariance)
     assert forgetting(calm, covariance) is calm
 
@@ -185,11 +185,11 @@ def test_a_filter_that_runs_away_gives_way_to_one_of_the_same_spectrum_that_forg
 def test_a_fit_ends_in_a_filter_that_forgets() -> None:
     model, c = drawn(1), np.eye(1, 4)
     gains = (replace(model, gain=size * model.gain) for size in np.linspace(1, 40, 4000))
-    wild = next(of for of in gains if np.abs(np.linalg.eigvals(of.a - of.a @ of.gain @ c)).max() > 1)
+    wild = next(of for of in gains if np.abs(np.linalg.eigvals(of.a - of.a @ of.gain @ c)).max() > 1.02)
     fitted = PredictionError(iterations=0).fit(wild, [rows(model)], [rows(model, seed=2)])
     assert isinstance(fitted.model, Innovations)
     assert np.abs(np.linalg.eigvals(fitted.model.a - fitted.model.a @ fitted.model.gain @ c)).max() < 1
-    assert fitted.held_out == pytest.approx(typical(innovations(fitted.model, [rows(model, seed=2)])), rel=0.1)
+    assert fitted.held_out < 0.5 * typical(innovations(wild, [rows(model, seed=2)]))
 
 
 def test_slow_outputs_count_as_much_as_fast_ones() -> None:
