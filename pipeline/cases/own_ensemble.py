@@ -7,13 +7,14 @@ from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
+from zipfile import BadZipFile
 
 import numpy as np
 
 from pipeline.cases.own_model import Doubts, OwnPlant, doubted, suits
 from pipeline.cases.reach import Reach, visited_mv
 from pipeline.config.exports import is_exported
-from pipeline.errors import PlantError, RecordError
+from pipeline.errors import ModelError, PlantError, RecordError
 from pipeline.evaluation.case import Array, Case
 from pipeline.evaluation.grounds import RecordVerdict
 from pipeline.evaluation.model_evidence import Metrics, identified_part
@@ -90,11 +91,14 @@ class OwnEnsemble(Case):
         return self._over(self.commanded, path, mv)
 
     def _over(self, signals: Signals, path: Path, mv: Array) -> OwnPlant:
-        """A model over the ranges of these signals."""
-        with np.load(path, allow_pickle=False) as file:
-            arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
-            colour, doubts = np.asarray(file["colour"]), Doubts.of(file)
-            noise = deviation(file["noise"] * file["y_scale"], colour)
+        """A model over the ranges of these signals; ModelError for a damaged file."""
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
+                colour, doubts = np.asarray(file["colour"]), Doubts.of(file)
+                noise = deviation(file["noise"] * file["y_scale"], colour)
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+            raise ModelError(f"{path} is damaged, or no identified model; remove it, and run its fit stage") from None
         dv = np.median(self.record.dv, axis=0)
         most = int(np.ceil(max(doubts.dead, self._doubts.dead)))
         plant = OwnPlant(signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
