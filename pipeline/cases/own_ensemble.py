@@ -29,8 +29,8 @@ from pipeline.records.set_points import SetPoints
 from pipeline.simulation.rests import courses
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
-CURVE = 101  # values of an MV over its range at which the models' turns are sought
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
+CURVE = 101  # values of an MV over its range at which the models' turns are sought: 1 % apart
 
 
 class OwnEnsemble(Case):
@@ -155,7 +155,7 @@ class OwnEnsemble(Case):
         return before_turns(found, values, np.array(curves), (float(max(low, mv.low)), float(min(high, mv.high))))
 
     def _curve(self, path: Path, values: Array) -> Array:
-        """What a model's CV (n,) reaches from its rest, as far as the answer is known, under values (n,) of its MV."""
+        """The CV (n,) that a model reaches from its rest, as far as the answer is known, under MVs (n,)."""
         plant = self._over(self.signals, path, visited_mv(self.record, self.signals.mv)[1])
         (signal,), ends = plant.sp_signals, courses(plant, plant.start[0], values[:, None], plant.foreseen)[:, -1, 0]
         span = signal.high - signal.low

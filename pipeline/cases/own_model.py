@@ -57,9 +57,10 @@ class OwnPlant(IdentifiedPlant):
 
     @property
     def foreseen(self) -> int:
-        """As far as predictive control looks ahead at most, after the dead time: later a record with loads says little.
+        """Samples after a move: as many as predictive control looks ahead at most, after the dead time.
 
-        Without it, an MV that acts after as many periods would seem not to act.
+        Of what comes later a record with loads says little.
+        Without the dead time, an MV that acts after as many samples would seem not to act.
         """
         return MOST_PERIODS + longest_memory(self.arrays)
 

@@ -66,9 +66,9 @@ def _turns(rising: Array, least: Array) -> list[int]:
 def _within(signals: Signals, low: float, high: float) -> Signals:
     """The signals with the MV's range from low to high, unless less than ``LEAST`` of it is left."""
     mv = signals.mv[0]
-    return (
-        replace(signals, mv=(replace(mv, low=low, high=high),)) if high - low >= LEAST * (mv.high - mv.low) else signals
-    )
+    if high - low < LEAST * (mv.high - mv.low):
+        return signals
+    return replace(signals, mv=(replace(mv, low=low, high=high),))
 
 
 def side_of(regions: Regions, median: float) -> tuple[float | None, float | None]:
