@@ -35,7 +35,7 @@ if NODE is None or not (HERE / "node_modules").is_dir():
 
 LIFETIME_MS = 2_500  # of a secure channel: the shortest that node-opcua grants
 PERIOD_MS = 100
-SPEED = 2.5  # of the loops: periods of .2 s
+SPEED = 1.0  # of the loops: periods of .5 s, of which an answer may take .4 s
 PATIENT_SPEED = 0.4  # periods of 1.25 s: a busy machine loses no connection to a loop that waits .8 of it for an answer
 
 
@@ -192,7 +192,8 @@ def _fault_and_restart(settings: Path, server: NodeServer) -> None:
         assert len({row["asked"] for row in server.rows()}) == 1  # a shadow writes nothing
         assert loop.does("mode", "AUTO").startswith("mode SHADOW -> AUTO")
         assert loop.does("sp", {"C_A": 0.55})
-        assert within(20, lambda: len({row["asked"] for row in server.rows()[-30:]}) > 5)
+        # Of all rows: at rest the last ones are alike, and this thread may come late.
+        assert within(60, lambda: len({row["asked"] for row in server.rows()}) > 5)
         for row in server.rows():
             assert row["type"] == "Float"
             assert row["asked"] == float(np.float32(row["asked"]))
