@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -21,8 +22,21 @@ ITERATIONS = 20
 NATS = 5.0
 """Log-likelihood of the held-out rows by which a network must be better than the best linear model."""
 
-LATER = (1, 2)
-"""Rows on offer beyond the dead time that the impulse response shows: a sixth of the answer is over by then."""
+ASIDE = ((1, 2), (3, 4), (6, 8), (11, 15), (20, 27), (36, 48))
+"""Rows from the dead time that the impulse response shows to those on offer, round by round while they explain as much.
+"""
+
+PLAIN = 3
+"""The smallest orders, by which dead times are compared first."""
+
+LIKELIEST = 4
+"""Dead times on offer with all orders."""
+
+ALIKE = 5.0
+"""Nats within which dead times are weighed; what is farther off hardly has a weight."""
+
+FAR = 10.0
+"""Nats by which a dead time is worse, from which on no farther one is tried."""
 
 KEPT = 8
 """Candidates of the first fold that are fitted on the others too."""
@@ -32,6 +46,9 @@ LARGEST = 12
 
 UNITS_OF, SEEDS, RIDGE = 3, 3, 1.0
 """Linear candidates that carry networks, seeds of each, and the weight of the ridge."""
+
+FITTED: tuple[Literal["gain", "all"], ...] = ("gain", "all")
+"""What a fit changes: the gain of the filter alone, or the model too."""
 
 TRAINED = 60
 """Iterations of a network's fit."""
@@ -52,46 +69,90 @@ class NoiseSearch:
 
     @classmethod
     def of(cls, rounds: Rounds) -> NoiseSearch:
-        """With the impulse responses without dead time, with the one that the first fold shows, and a little more.
-
-        A dead time that is known spares a model of few states the lags that would have to imitate it.
-        """
-        linears = LinearSearch.of(rounds)
-        offered = list(dict.fromkeys(s.delays for s, _ in linears.starts))
-        none = Structure("balanced", 0, (0, 0), offered[0])
-        later = [rounds.problem.known.delays([d + more for d in offered[-1]]) for more in LATER]
-        return cls(
-            rounds, replace(linears, starts=linears.starts | rounds.starts([replace(none, delays=d) for d in later]))
-        )
+        """With the impulse responses without dead time, and with the one that the first fold shows."""
+        return cls(rounds, LinearSearch.of(rounds))
 
     def linear(self, orders: Sequence[int]) -> list[Trial]:
-        """The best linear candidates over all folds, the best first; ModelError where none can be fitted."""
-        delays = list(dict.fromkeys(s.delays for s, _ in self.linears.starts))
+        """The best linear candidates over all folds, the best first; ModelError where none can be fitted.
+
+        Of dead times that explain the rows alike, the middle one goes first, see ``middle_first``.
+        """
+        offered = [n for n in orders if n <= LARGEST]
+        scanned = self._scanned(offered[:PLAIN])
+        delays = [t.structure.delays for t in _best_of_each(scanned)][:LIKELIEST]
         structures = [
-            Structure("balanced", n, (0, 0), d, noise=noise)
-            for n in orders
-            if n <= LARGEST
-            for d in delays
-            for noise in ("gain", "all")
+            Structure("balanced", n, (0, 0), d, noise=noise) for n in offered for d in delays for noise in FITTED
         ]
-        affordable = self.rounds.affordable(structures, ITERATIONS, 0.5)
-        tasks = [Task(s, 0, ITERATIONS, start=self.linears.start(s, 0)) for s in affordable]
+        structures = [s for s in structures if all(s != t.structure for t in scanned)]
+        tasks = [self._task(s, 0) for s in self.rounds.affordable(structures, ITERATIONS, 0.5)]
         trials, reasons = self.rounds.trials(tasks, "linear models with their noise")
-        finite = [t for t in trials if np.isfinite(t.error)]
+        finite = [t for t in (*scanned, *trials) if np.isfinite(t.error)]
         if not finite:
             why = reasons[0] if reasons else "every filter over held-out rows explodes"
             raise ModelError(f"no linear model fits the record: {why}")
-        shortlist = self.ranked(finite)[:KEPT]
-        further = [
-            Task(t.structure, k, ITERATIONS, start=self.linears.start(t.structure, k))
-            for t in shortlist
-            for k in self._folds[1:]
-        ]
+        ranked = self.ranked(finite)
+        near = [t for t in _best_of_each(ranked) if t.against == ranked[0].against]
+        near = [t for t in near if nats(self.rounds.problem, t, ranked[0]) <= FAR]
+        shortlist = list(dict.fromkeys([*ranked[:KEPT], *near]))
+        further = [self._task(t.structure, k) for t in shortlist for k in self._folds[1:]]
         others = {t.structure: t.fits for t in self.rounds.trials(further, "the best of them on all rows")[0]}
         whole = [Trial(t.structure, {**t.fits, **others.get(t.structure, {})}) for t in shortlist]
         whole = [t for t in whole if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
         whole = self.following(whole) or whole
-        return self.ranked(whole) if whole else shortlist
+        return self.middle_first(self.ranked(whole)) if whole else shortlist
+
+    def _scanned(self, orders: Sequence[int]) -> list[Trial]:
+        """Fits of the first fold with dead times about those that are seen, ranked; all MVs' are moved together.
+
+        A load hides how an answer begins, and models of few states imitate a dead time by lags: the rows then tell no
+        dead time from many others, and the first ones of an impulse response least of all.
+        """
+        problem = self.rounds.problem
+        known, n_mv = problem.known, problem.n_mv
+        none, *later = dict.fromkeys(s.delays for s, _ in self.linears.starts)
+        seen = later[-1] if later else none
+        trials: list[Trial] = []
+        tried: set[tuple[int, ...]] = set()
+        sides = [-1, 1]
+        for aside in ((0,), *ASIDE):
+            offered = {none} if aside == (0,) else set[tuple[int, ...]]()
+            of_side = {}
+            for side in sides:
+                moved = ([max(d + side * n, 0) if j < n_mv else d for j, d in enumerate(seen)] for n in aside)
+                of_side[side] = {known.delays(d) for d in moved}
+                offered |= of_side[side]
+            offered -= tried
+            tried |= offered
+            trials = self.ranked([*trials, *self._fitted(sorted(offered), orders)])
+            near = {t.structure.delays for t in _best_of_each(trials) if nats(problem, t, trials[0]) <= FAR}
+            if aside != (0,):
+                sides = [side for side in sides if near & of_side[side] & offered]
+        return trials
+
+    def _fitted(self, delays: Sequence[tuple[int, ...]], orders: Sequence[int]) -> list[Trial]:
+        """The fits of the first fold with some dead times and orders that do not explode."""
+        self.linears.starts.update(self.rounds.starts([Structure("balanced", 0, (0, 0), d) for d in delays]))
+        structures = [Structure("balanced", n, (0, 0), d, noise="all") for d in delays for n in orders]
+        if not structures:
+            return []
+        tasks = [self._task(s, 0) for s in self.rounds.affordable(structures, ITERATIONS, 0.3)]
+        return [t for t in self.rounds.trials(tasks, "dead times")[0] if np.isfinite(t.error)]
+
+    def middle_first(self, ranked: list[Trial]) -> list[Trial]:
+        """The candidates, the best one of the middle dead time first: the median of those that explain the rows alike.
+
+        Each counts by its likelihood. The likeliest one of many alike is chance, and a law that trusts one too early
+        swings on the plant.
+        """
+        best = ranked[0]
+        near = [(self._cost(t, best), t) for t in _best_of_each(ranked) if t.against == best.against]
+        near = sorted(((c, t) for c, t in near if c - self._cost(best, best) <= ALIKE), key=lambda one: _late(one[1]))
+        weights = np.cumsum([np.exp(self._cost(best, best) - c) for c, _ in near])
+        middle = near[int(np.searchsorted(weights, 0.5 * weights[-1]))][1]
+        return [middle, *(t for t in ranked if t is not middle)]
+
+    def _task(self, structure: Structure, fold: int) -> Task:
+        return Task(structure, fold, ITERATIONS, start=self.linears.start(structure, fold))
 
     def networks(self, linear: Sequence[Trial], units: Sequence[int]) -> list[Trial]:
         """Networks on the best linear candidates, trained over all folds from several seeds."""
@@ -126,14 +187,25 @@ class NoiseSearch:
         One-step errors hardly tell orders apart, and a state less is one less to mislead. A refined model goes before
         the ARX's response as it is, whose tail still holds what the prior made of noise.
         """
-        best = min(trials, key=lambda t: t.error)
+        best = min(trials, key=lambda t: t.error, default=None)
+        return [] if best is None else sorted(trials, key=lambda t: (t.against, self._cost(t, best)))
 
-        def cost(t: Trial) -> tuple[int, float]:
-            likely = nats(self.rounds.problem, t, best) + t.structure.order + (t.structure.noise == "gain")
-            return t.against, likely
-
-        return sorted(trials, key=cost)
+    def _cost(self, trial: Trial, best: Trial) -> float:
+        """Nats by which a trial is worse than the best, and its states."""
+        return nats(self.rounds.problem, trial, best) + trial.structure.order + (trial.structure.noise == "gain")
 
     @property
     def _folds(self) -> range:
         return range(len(self.rounds.problem.folds))
+
+
+def _best_of_each(ranked: Sequence[Trial]) -> list[Trial]:
+    """The first trial of each dead time."""
+    found: dict[tuple[int, ...], Trial] = {}
+    for t in ranked:
+        found.setdefault(t.structure.delays, t)
+    return list(found.values())
+
+
+def _late(trial: Trial) -> int:
+    return sum(trial.structure.delays)
