@@ -222,7 +222,8 @@ def _reasons(
             words = f"{i.name} follows {pv} (feedback explains {100 * share:.0f} % of its moves)"
             alone = moved_sp < FEW_MOVES
             if alone:
-                words += ", and no set point was moved: the record shows the controller more than the plant"
+                moved = f"the set points were moved {moved_sp} times only" if moved_sp else "no set point was moved"
+                words += f", and {moved}: the record shows the controller more than the plant"
             found.append((2 if alone and share > FOLLOWS_CLOSELY else 1 if alone else 0, words))
     for pair, r in correlation.items():
         if abs(r) > ALIKE:

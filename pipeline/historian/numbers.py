@@ -41,6 +41,8 @@ THOUSANDS = {  # by the decimal sign: certain ones, and those of one sign alone,
 ODD = re.compile(rf"[{MINUS}{UNSEEN}\uff0b{BLANKS}'’‘ʼ`´]|-$")  # what a plain number has not
 WITH_UNIT = r"^(?P<number>[+-]?[\d.,]*\d)(?P<unit>\s*[%°‰]\S*|\s+[^\s\d][^\s\d]*)$"
 LOOSE = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
+# Codes of a state, as [-11059] No Good Data or Error 254: a number in brackets, or behind a word that is no limit.
+STATE = re.compile(r"\[|^\W*(?!over|under|above|below|more|less|high|low|max|min|hi\b|lo\b)[^\W\d_]{3,}", re.IGNORECASE)
 
 Codes = NDArray[np.uint8]
 
@@ -76,7 +78,9 @@ def plain(text: str) -> str:
 
 
 def loose_number(text: str) -> float | None:
-    """The number that a text shows beside other signs, as ``(5,2)`` or ``< 0.5``; None for none or several."""
+    """The number that a text shows beside other signs, as ``(5,2)`` or ``< 0.5``; None for none, several, or a code."""
+    if STATE.search(text):
+        return None
     found = LOOSE.findall(plain(text).replace("- ", "-"))
     return float(found[0].replace(",", ".")) if len(found) == 1 else None
 

@@ -18,6 +18,7 @@ MOST_TRIED = 12  # candidates in the table, the best first
 COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white
 OF_NOISE = 1.1  # error over the noise: no model is nearer
 ANSWERED = 0.1  # of the steepest slope: from here on an output answers
+APART = 2  # periods between likely dead times from which on the report asks for the true one
 SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
 
 
@@ -51,7 +52,7 @@ def model_section(evidence: Evidence) -> ModelSection | None:
     if not part:
         return None
     mvs = [s.name for s in evidence.case.plant_class.mv_signals]
-    verdicts = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs))
+    verdicts = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs), *_dead_times(evidence, part))
     sentences = (*verdicts, *_asked(evidence), *_one_side(evidence))
     judged = str((part.get("structure") or {}).get("judged") or "free run")
     return ModelSection(sentences, _variables(evidence, part), _answers(evidence, part), _tried(part), judged)
@@ -100,6 +101,21 @@ def _left_open(part: Mapping[str, Any], mvs: Sequence[str]) -> tuple[str, ...]:
     return (
         f"Models as likely as this one differ by {gains}, by {_by(found['pace_sd'][0])} in speed and by {dead:.2g} "
         "periods in dead time (standard deviations).",
+    )
+
+
+def _dead_times(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
+    """The inputs whose dead time a record in closed loop hardly tells, and how somebody says what it is."""
+    plant, found = evidence.case.plant_class, (part.get("open") or {}).get("dead_times") or {}
+    wide = {name: plant.period_s * np.array(ends) for name, ends in found.items() if ends[1] - ends[0] >= APART}
+    if not wide:
+        return ()
+    spans = " and ".join(f"from {number(low)} to {number(high)} s of {name}" for name, (low, high) in wide.items())
+    first = f"{plant.sp_signals[0].name}/{next(iter(wide))}=dead 30..50"
+    return (
+        f"Dead times {spans} explain the record alike, and the model has the middle of them. If you know the true one, "
+        f'say it in column `known` of the table of tags, or as --known "{first}" (in s): the controllers can then be '
+        "quicker.",
     )
 
 

@@ -122,7 +122,20 @@ def test_three_digits_behind_both_signs_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "number"), [("(5.2)", 5.2), ("< 0,5", 0.5), (">100", 100), ("- 7 *", -7), ("bad", None), ("1;2", None)]
+    ("text", "number"),
+    [
+        ("(5.2)", 5.2),
+        ("< 0,5", 0.5),
+        (">100", 100),
+        ("- 7 *", -7),
+        ("bad", None),
+        ("1;2", None),
+        ("[-11059] No Good Data", None),
+        ("Error 254", None),
+        ("over 100", 100),
+        ("Low: 2", 2),
+        ("7 degC", 7),
+    ],
 )
 def test_the_number_that_a_text_shows(text: str, number: float | None) -> None:
     assert loose_number(text) == number

@@ -147,3 +147,18 @@ def test_a_share_of_a_gain_of_nearly_zero_is_no_number(
     found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
     assert found is not None
     assert any(says in line for line in found.verdicts)
+
+
+@pytest.mark.parametrize(("most", "asks"), [(1, False), (4, True)])
+def test_the_report_asks_for_a_dead_time_that_the_record_does_not_tell(
+    most: int, asks: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    certain = {"gain_sd": [0.1, 0.1], "pace_sd": [0.05], "dead_sd": [0.3]}
+    part = {**PART, "open": certain | {"dead_times": {"u0": [0, most], "u1": [1, 1]}}}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    said = [line for line in found.verdicts if "--known" in line]
+    assert len(said) == asks
+    assert all("y0/u0=dead" in line and "u1" not in line for line in said)

@@ -183,7 +183,7 @@ class IdentifiedPart(Part):
             | ({"sign_margin": dict.fromkeys(names[:n_cv], margin)} if np.isfinite(margin) else {})
             | said
             | ({"held": dict(source.held)} if source.held else {}),
-            "open": {name: values.tolist() for name, values in open_to.items()},
+            "open": {name: values.tolist() for name, values in open_to.items()} | _likely(selection, inputs),
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],
             "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
             "warnings": warnings,
@@ -210,6 +210,13 @@ def _proof(
         return figures
     # A free run of a closed loop holds the loads that the controller fought, and says nothing of the model.
     return {"answers": figures["answers"], "one_step": foreseen(problem, chosen, list(runs), scales.y_scale)}
+
+
+def _likely(selection: Selection, inputs: Sequence[Signal]) -> dict[str, Any]:
+    """Of each input the least and the most periods of dead time that explain a record in closed loop alike."""
+    if not selection.dead_times:
+        return {}
+    return {"dead_times": {s.name: list(ends) for s, ends in zip(inputs, selection.dead_times, strict=True)}}
 
 
 def _unseen(mvs: Sequence[Signal], rows: ScaledRecord, scales: Scales) -> list[str]:

@@ -9,12 +9,15 @@ from typing import Literal
 import numpy as np
 
 from pipeline.errors import ModelError
+from pipeline.historian.pace import MOST_PERIODS
+from pipeline.models.identified.assembly import step_responses
 from pipeline.models.identified.candidates import Task
 from pipeline.models.identified.innovations import innovations
 from pipeline.models.identified.linear_search import LinearSearch
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.structure import Problem, Structure
 from pipeline.models.identified.trial import Trial
+from pipeline.tuning.responses import reached
 
 ITERATIONS = 20
 """Of a linear fit."""
@@ -32,8 +35,11 @@ PLAIN = 3
 LIKELIEST = 4
 """Dead times on offer with all orders."""
 
-ALIKE = 5.0
-"""Nats within which dead times are weighed; what is farther off hardly has a weight."""
+LIKELY = 2.0
+"""Nats up to which a dead time is as likely as the best: it is the 95 % limit of a likelihood ratio of one number."""
+
+HALF = 0.5
+"""Share of an answer's last value at which its rise is compared with its dead time."""
 
 FAR = 10.0
 """Nats by which a dead time is worse, from which on no farther one is tried."""
@@ -60,6 +66,44 @@ def nats(problem: Problem, worse: Trial, better: Trial) -> float:
     return float(problem.data.y.shape[1] * rows * np.log(worse.error / better.error))
 
 
+def worse(problem: Problem, trial: Trial, best: Trial) -> float:
+    """Nats by which a trial is worse than another, each state and the freedom of the whole model counting one."""
+    more = trial.structure.order - best.structure.order
+    plain = (trial.structure.noise == "gain") - (best.structure.noise == "gain")
+    return nats(problem, trial, best) + more + plain
+
+
+def behind(problem: Problem, trial: Trial, best: Trial) -> float:
+    """Nats over all rows by which a trial is worse than another, each state counting one: of two dead times.
+
+    They have as many parameters, so that the rows of a fit count too. The held-out ones alone are few: 4 nats for a
+    dead time that is not there were seen in noise of 10 %.
+    """
+    rows = problem.data.y.shape[1] * len(problem.data.y)
+    ratio = _of_all_rows(problem, trial) / _of_all_rows(problem, best)
+    return float(rows * np.log(ratio)) + trial.structure.order - best.structure.order
+
+
+def _of_all_rows(problem: Problem, trial: Trial) -> float:
+    """The rms one-step error of the fits of all folds, over their training and their held-out rows."""
+    squares = []
+    for k in trial.folds:
+        fitted, fold = trial.of_fold(k)[0], problem.folds[k]
+        held = fold.held.stop - fold.held.start
+        share = held / len(problem.data.y)
+        squares.append(share * fitted.held_out**2 + (1 - share) * fitted.trained**2)
+    return float(np.sqrt(np.mean(squares)))
+
+
+def likely_dead_times(problem: Problem, linear: Sequence[Trial]) -> list[tuple[int, int]]:
+    """Of each input the least and the most periods of dead time of models that are as likely as the best one."""
+    least = min(t.against for t in linear)
+    own = [t for t in linear if t.against == least and t.structure.noise == "all"] or linear[:1]
+    best = min(own, key=lambda t: behind(problem, t, own[0]))
+    found = [t.structure.delays for t in own if behind(problem, t, best) <= LIKELY]
+    return [(min(of), max(of)) for of in zip(*found, strict=True)]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseSearch:
     """The search among models with their noise of one problem; ``linears`` finds their impulse responses."""
@@ -75,88 +119,116 @@ class NoiseSearch:
     def linear(self, orders: Sequence[int]) -> list[Trial]:
         """The best linear candidates over all folds, the best first; ModelError where none can be fitted.
 
-        Of dead times that explain the rows alike, the middle one goes first, see ``middle_first``.
+        Where dead times explain the rows alike, the best one of the middle of them goes first, see ``_along``.
         """
         offered = [n for n in orders if n <= LARGEST]
-        scanned = self._scanned(offered[:PLAIN])
-        delays = [t.structure.delays for t in _best_of_each(scanned)][:LIKELIEST]
+        scanned, middle = self._scanned(offered[:PLAIN])
+        delays = list(dict.fromkeys([middle, *(t.structure.delays for t in scanned)]))[:LIKELIEST]
         structures = [
             Structure("balanced", n, (0, 0), d, noise=noise) for n in offered for d in delays for noise in FITTED
         ]
-        structures = [s for s in structures if all(s != t.structure for t in scanned)]
-        tasks = [self._task(s, 0) for s in self.rounds.affordable(structures, ITERATIONS, 0.5)]
-        trials, reasons = self.rounds.trials(tasks, "linear models with their noise")
-        finite = [t for t in (*scanned, *trials) if np.isfinite(t.error)]
-        if not finite:
+        known = {t.structure for t in scanned}
+        affordable = self.rounds.affordable([s for s in structures if s not in known], ITERATIONS, 0.5)
+        trials, reasons = self.rounds.trials([self._task(s, 0) for s in affordable], "linear models with their noise")
+        shortlist = self.ranked([t for t in trials if np.isfinite(t.error)])[:KEPT]
+        if not (shortlist or scanned):
             why = reasons[0] if reasons else "every filter over held-out rows explodes"
             raise ModelError(f"no linear model fits the record: {why}")
-        ranked = self.ranked(finite)
-        near = [t for t in _best_of_each(ranked) if t.against == ranked[0].against]
-        near = [t for t in near if nats(self.rounds.problem, t, ranked[0]) <= FAR]
-        shortlist = list(dict.fromkeys([*ranked[:KEPT], *near]))
         further = [self._task(t.structure, k) for t in shortlist for k in self._folds[1:]]
         others = {t.structure: t.fits for t in self.rounds.trials(further, "the best of them on all rows")[0]}
         whole = [Trial(t.structure, {**t.fits, **others.get(t.structure, {})}) for t in shortlist]
         whole = [t for t in whole if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
+        whole += scanned
         whole = self.following(whole) or whole
-        return self.middle_first(self.ranked(whole)) if whole else shortlist
+        if not whole:
+            return shortlist
+        ranked = self.ranked(whole)
+        best = ranked[0]
+        of_middle = [t for t in ranked if t.structure.delays == middle and t.against == best.against]
+        lead = next((t for t in of_middle if nats(self.rounds.problem, t, best) <= FAR), best)
+        return [lead, *(t for t in ranked if t is not lead)]
 
-    def _scanned(self, orders: Sequence[int]) -> list[Trial]:
-        """Fits of the first fold with dead times about those that are seen, ranked; all MVs' are moved together.
+    def _scanned(self, orders: Sequence[int]) -> tuple[list[Trial], tuple[int, ...]]:
+        """(fits of all folds with dead times about those that are seen, ranked; the middle of those that are alike).
 
         A load hides how an answer begins, and models of few states imitate a dead time by lags: the rows then tell no
-        dead time from many others, and the first ones of an impulse response least of all.
+        dead time from many others, and the first ones of an impulse response least of all. All MVs' dead times are
+        moved together, then each one's, then those of the measured disturbances.
         """
         problem = self.rounds.problem
-        known, n_mv = problem.known, problem.n_mv
+        n_v, n_mv = problem.data.v.shape[1], problem.n_mv
         none, *later = dict.fromkeys(s.delays for s, _ in self.linears.starts)
-        seen = later[-1] if later else none
-        trials: list[Trial] = []
-        tried: set[tuple[int, ...]] = set()
-        sides = [-1, 1]
-        for aside in ((0,), *ASIDE):
-            offered = {none} if aside == (0,) else set[tuple[int, ...]]()
+        at = later[-1] if later else none
+        trials = self.ranked(self._fitted(list(dict.fromkeys([none, at])), orders))
+        alone = [(j,) for j in range(n_v) if n_mv > 1 or j >= n_mv]
+        for inputs in (tuple(range(n_mv)), *alone):
+            if not trials:
+                break
+            trials, at = self._along(inputs, at, orders if len(inputs) == n_mv else [trials[0].structure.order], trials)
+        return trials, at
+
+    def _along(
+        self, inputs: Sequence[int], at: tuple[int, ...], orders: Sequence[int], trials: list[Trial]
+    ) -> tuple[list[Trial], tuple[int, ...]]:
+        """(trials and those with dead times of some inputs beside ``at``, ranked; the median of these dead times).
+
+        Each counts by its likelihood, and the less the more of its answer's rise it makes: a record that tells nothing
+        tells of no dead time. The likeliest one of many alike is chance, and a law that trusts one too early swings on
+        the plant.
+        """
+        known, places = self.rounds.problem.known, list(inputs)
+        line, sides, tried = {at}, [-1, 1], {t.structure.delays for t in trials}
+        for aside in ASIDE:
             of_side = {}
             for side in sides:
-                moved = ([max(d + side * n, 0) if j < n_mv else d for j, d in enumerate(seen)] for n in aside)
-                of_side[side] = {known.delays(d) for d in moved}
-                offered |= of_side[side]
-            offered -= tried
-            tried |= offered
-            trials = self.ranked([*trials, *self._fitted(sorted(offered), orders)])
-            near = {t.structure.delays for t in _best_of_each(trials) if nats(problem, t, trials[0]) <= FAR}
-            if aside != (0,):
-                sides = [side for side in sides if near & of_side[side] & offered]
-        return trials
+                moved = ([max(d + side * n, 0) if j in places else d for j, d in enumerate(at)] for n in aside)
+                of_side[side] = {known.delays(d) for d in moved} - line
+                line |= of_side[side]
+            trials = self.ranked([*trials, *self._fitted(sorted(line - tried), orders)])
+            tried |= line
+            costs = self._by_dead_time(trials)
+            near = {d for d, (cost, _) in costs.items() if cost <= FAR}
+            sides = [side for side in sides if near & of_side[side]]
+        costs = {d: found for d, found in self._by_dead_time(trials).items() if d in line}
+        late = {d: float(sum(d[j] for j in places)) for d in costs}
+        ordered = sorted(costs, key=lambda d: late[d])
+        if len(ordered) < 2:
+            return trials, (ordered or [at])[0]
+        n_y = self.rounds.problem.data.y.shape[1]
+        prior = np.gradient([late[d] for d in ordered]) * [_of_lags(costs[d][1], places, n_y) for d in ordered]
+        weights = np.cumsum(prior * np.exp([-costs[d][0] for d in ordered]))
+        return trials, ordered[int(np.searchsorted(weights, 0.5 * weights[-1]))]
+
+    def _by_dead_time(self, trials: Sequence[Trial]) -> dict[tuple[int, ...], tuple[float, Trial]]:
+        """Of each dead time its best trial, and the nats by which it is behind the best of all.
+
+        Those count alone that contradict what is known the least.
+        """
+        own = [t for t in trials if t.against == trials[0].against]
+        cost = {id(t): behind(self.rounds.problem, t, own[0]) for t in own}
+        least = min(cost.values())
+        found: dict[tuple[int, ...], tuple[float, Trial]] = {}
+        for t in sorted(own, key=lambda t: cost[id(t)]):
+            found.setdefault(t.structure.delays, (cost[id(t)] - least, t))
+        return found
 
     def _fitted(self, delays: Sequence[tuple[int, ...]], orders: Sequence[int]) -> list[Trial]:
-        """The fits of the first fold with some dead times and orders that do not explode."""
+        """The fits of all folds with some dead times and orders, where none explodes."""
         self.linears.starts.update(self.rounds.starts([Structure("balanced", 0, (0, 0), d) for d in delays]))
         structures = [Structure("balanced", n, (0, 0), d, noise="all") for d in delays for n in orders]
         if not structures:
             return []
-        tasks = [self._task(s, 0) for s in self.rounds.affordable(structures, ITERATIONS, 0.3)]
-        return [t for t in self.rounds.trials(tasks, "dead times")[0] if np.isfinite(t.error)]
-
-    def middle_first(self, ranked: list[Trial]) -> list[Trial]:
-        """The candidates, the best one of the middle dead time first: the median of those that explain the rows alike.
-
-        Each counts by its likelihood. The likeliest one of many alike is chance, and a law that trusts one too early
-        swings on the plant.
-        """
-        best = ranked[0]
-        near = [(self._cost(t, best), t) for t in _best_of_each(ranked) if t.against == best.against]
-        near = sorted(((c, t) for c, t in near if c - self._cost(best, best) <= ALIKE), key=lambda one: _late(one[1]))
-        weights = np.cumsum([np.exp(self._cost(best, best) - c) for c, _ in near])
-        middle = near[int(np.searchsorted(weights, 0.5 * weights[-1]))][1]
-        return [middle, *(t for t in ranked if t is not middle)]
+        affordable = self.rounds.affordable(structures, ITERATIONS * len(self._folds), 0.3)
+        tasks = [self._task(s, k) for s in affordable for k in self._folds]
+        trials = self.rounds.trials(tasks, "dead times")[0]
+        return [t for t in trials if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
 
     def _task(self, structure: Structure, fold: int) -> Task:
         return Task(structure, fold, ITERATIONS, start=self.linears.start(structure, fold))
 
     def networks(self, linear: Sequence[Trial], units: Sequence[int]) -> list[Trial]:
-        """Networks on the best linear candidates, trained over all folds from several seeds."""
-        bases = linear[:UNITS_OF]
+        """Networks on the best linear candidates of the first one's dead times, from several seeds, over all folds."""
+        bases = [t for t in linear if t.structure.delays == linear[0].structure.delays][:UNITS_OF]
         offers = [(replace(t.structure, n_hidden=n, ridge=RIDGE, noise="all"), t) for t in bases for n in units[:2]]
         tasks = [
             Task(s, k, TRAINED, seed, base=t.fits[k, 0]) for s, t in offers for seed in range(SEEDS) for k in t.folds
@@ -188,24 +260,25 @@ class NoiseSearch:
         the ARX's response as it is, whose tail still holds what the prior made of noise.
         """
         best = min(trials, key=lambda t: t.error, default=None)
-        return [] if best is None else sorted(trials, key=lambda t: (t.against, self._cost(t, best)))
-
-    def _cost(self, trial: Trial, best: Trial) -> float:
-        """Nats by which a trial is worse than the best, and its states."""
-        return nats(self.rounds.problem, trial, best) + trial.structure.order + (trial.structure.noise == "gain")
+        return [] if best is None else sorted(trials, key=lambda t: (t.against, worse(self.rounds.problem, t, best)))
 
     @property
     def _folds(self) -> range:
         return range(len(self.rounds.problem.folds))
 
 
-def _best_of_each(ranked: Sequence[Trial]) -> list[Trial]:
-    """The first trial of each dead time."""
-    found: dict[tuple[int, ...], Trial] = {}
-    for t in ranked:
-        found.setdefault(t.structure.delays, t)
-    return list(found.values())
+def _of_lags(trial: Trial, inputs: Sequence[int], n_y: int) -> float:
+    """Share of the time to half of an answer that is no dead time, the mean of some inputs' answers.
 
-
-def _late(trial: Trial) -> int:
-    return sum(trial.structure.delays)
+    Of each input the answer counts of the output that it moves most, over the rows that a law looks ahead at most.
+    """
+    model = trial.of_fold(trial.folds[0])[0].model.plant
+    size = np.ones(model.n_v)
+    curves = step_responses(model, np.zeros(model.n_x), np.zeros(model.n_v), size, MOST_PERIODS)
+    shares = []
+    for j in inputs:
+        moved = curves[j, :, :n_y]
+        one = moved[:, int(np.abs(moved[-1]).argmax())]
+        rise = reached(one / one[-1], HALF) if one[-1] else float(MOST_PERIODS)
+        shares.append(rise / (rise + trial.structure.delays[j]))
+    return float(np.mean(shares))

@@ -12,7 +12,7 @@ from pipeline.models.identified.curvature import curved
 from pipeline.models.identified.drift import Drift, drift_of
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
-from pipeline.models.identified.noise_search import NATS, NoiseSearch, nats
+from pipeline.models.identified.noise_search import NATS, NoiseSearch, likely_dead_times, nats
 from pipeline.models.identified.rests import INTEGRATES
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.row_convention import may_act_in_its_row
@@ -53,6 +53,9 @@ class Selection:
     drifts: bool  # whether gain or level move inside the record
     innovations: float | None = None  # nats by which one-step errors prefer the network; None: free runs judged
     farthest: float = FARTHEST  # scaled: where rests of a network may lie
+    dead_times: Sequence[
+        tuple[int, int]
+    ] = ()  # [periods] of each input, least and most of those alike; see NoiseSearch
 
     @property
     def nonlinear(self) -> bool:
@@ -155,7 +158,8 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     rival = min((ranked[0], linear[0]), key=lambda t: t.rank)
     gained = 0.0 if best is None else nats(rounds.problem, rival, best)
     every, spent = [*linear, *networks], rounds.budget.spent
-    return Selection(linear[0], best, every, spent, problem.settles, False, gained, problem.farthest)
+    alike = likely_dead_times(problem, ranked)
+    return Selection(linear[0], best, every, spent, problem.settles, False, gained, problem.farthest, alike)
 
 
 def _nearly(trial: Trial, best: Trial) -> bool:
@@ -167,13 +171,15 @@ def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
 
     A load that wanders and a state of the plant that drifts are hard to tell apart one row ahead. A state that drifts
     in one part of the record alone, or that a model of a quick plant does without, is the load's, and leaves the plant
-    without a gain. One that settles clearly goes before others, and alone where all parts show a pole at 1.
+    without a gain. One that settles clearly goes before others, and alone where all parts show a pole at 1; of these
+    one of the same dead times first.
     """
     best = linear[0]
     slowest = [_slowest(best, fold) for fold in best.folds]
     if max(slowest) <= INTEGRATES:
         return linear
     alike = [t for t in linear if t.against == best.against and nats(problem, t, best) <= NATS]
+    alike.sort(key=lambda t: t.structure.delays != best.structure.delays)
     for limit in (SETTLES, INTEGRATES) if min(slowest) <= SETTLES else (SETTLES,):
         settling = next((t for t in alike if all(_slowest(t, fold) <= limit for fold in t.folds)), None)
         if settling is not None:

@@ -10,11 +10,16 @@ import pytest
 from closed_loop_records import LOOPS, SIGNALS
 
 from pipeline.models.identified.candidates import on_all_rows
+from pipeline.models.identified.dynamics import Dynamics
 from pipeline.models.identified.identified_part import IdentifiedPart
 from pipeline.models.identified.innovations import innovations
+from pipeline.models.identified.linear_search import LinearSearch
 from pipeline.models.identified.noise_search import NoiseSearch
+from pipeline.models.identified.output_error import Fitted
 from pipeline.models.identified.rounds import Rounds
-from pipeline.models.identified.structure import Budget
+from pipeline.models.identified.scaled_record import Fold
+from pipeline.models.identified.structure import Budget, Problem, Structure
+from pipeline.models.identified.trial import Trial
 from pipeline.models.part import Learnt, Source
 
 QUICK = IdentifiedPart(units=(), orders=(2, 3))
@@ -74,3 +79,48 @@ def test_a_fit_whose_filter_explodes_over_the_whole_record_is_no_candidate() -> 
     assert [set(t.fits) for t in search.following([twice])] == [set(trial.fits)]
     # Of such a fit the one of its fold is kept as it is, and the record has a model all the same.
     assert on_all_rows(problem, trial.structure, wild) is wild
+
+
+def searched_over(errors: dict[int, float], monkeypatch: pytest.MonkeyPatch) -> tuple[list[int], int]:
+    """(dead times that were tried, the one that is taken) where held-out errors of a fit of order 2 are ``errors``."""
+    data = type("Rows", (), {"y": np.zeros((2_000, 1)), "v": np.zeros((2_000, 1))})()
+    folds = (Fold(slice(0, 1_000), slice(1_000, 2_000)),)
+    rounds = Rounds(Problem(data, folds, 1), Budget(1.0, 2_000, 1), "test")
+    none = Structure("balanced", 0, (0, 0), (0,))
+    search = NoiseSearch(rounds, LinearSearch(rounds, {(none, 0): "none"}))
+    tried = []
+
+    def fitted(_: NoiseSearch, delays: list[tuple[int, ...]], orders: list[int]) -> list[Trial]:
+        tried.extend(d for (d,) in delays)
+        model = Dynamics.linear(np.array([[0.95]]), np.array([[1.0]]))
+        fits = {d: {(0, 0): Fitted(model, [], 0.1, errors.get(d, 2.0), 1)} for (d,) in delays}
+        return [Trial(Structure("balanced", 2, (0, 0), (d,), noise="all"), of) for d, of in fits.items()]
+
+    monkeypatch.setattr(NoiseSearch, "_fitted", fitted)
+    _, (taken,) = search._scanned([2])
+    return sorted(tried), taken
+
+
+def test_of_dead_times_that_explain_the_rows_alike_the_middle_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1,000 held-out rows: a nat is .1 % of the error."""
+    alike = {d: 1.0 + 1e-4 * (d % 2) for d in range(7)}
+    tried, taken = searched_over(alike, monkeypatch)
+    assert taken in (2, 3, 4)
+    assert {0, 1, 2, 3, 4, 6, 8} <= set(tried)
+    # One that is certain stays, and nothing far from it is tried.
+    tried, taken = searched_over({0: 1.0, 1: 1.05}, monkeypatch)
+    assert taken == 0
+    assert max(tried) == 2
+    # The best of a valley that the impulse response does not show is found.
+    valley = {d: 1.0 + 0.004 * abs(d - 8) for d in range(20)}
+    assert searched_over(valley, monkeypatch)[1] == 8
+
+
+def test_likely_dead_times_hold_the_one_of_the_plant() -> None:
+    """The plant answers after three rows; the load hides how the answer begins."""
+    for seed in (0, 1):
+        found = learnt("dead time, set points", seed).metrics
+        low, high = found["open"]["dead_times"]["u"]
+        dead = LOOPS["dead time, set points"].dead
+        assert low - 1 <= dead - 1 <= high + 1
+        assert low <= found["structure"]["delays"][0] <= high
