@@ -37,7 +37,7 @@ from pipeline.laws.predictive.plan import Cost, Planner
 from pipeline.laws.predictive.predictive import Predictive
 from pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
 from pipeline.laws.predictive.side_by_side import side_by_side
-from pipeline.laws.predictive.trials import LOOPS, Outcome, Trials
+from pipeline.laws.predictive.trials import LOOPS, Outcome, Trials, _late
 from pipeline.laws.predictive.tuning import FORGETS, TRAVEL, Candidate, calmest, judged, searched, tuned
 from pipeline.models.identified.identified import Identified
 from pipeline.models.static.mlp import MLP
@@ -561,6 +561,30 @@ def test_plants_of_the_trials_err_as_far_as_the_record_leaves_open_and_no_less_t
     open_to = Trials.draw(model, signals, 12, seed=0)
     assert open_to.gain[1, 0] == pytest.approx(1.4)
     assert open_to.pace[2, 0] == pytest.approx(1.6)
+
+
+@pytest.mark.parametrize("late", [0.3, 1.0, 2.4])
+def test_a_plant_that_answers_later_is_moved_by_the_mv_of_so_many_samples_before(late: float) -> None:
+    course = torch.linspace(0, 1, 9).double() ** 2  # of an MV, over samples
+    whole, rest = torch.tensor([int(late), 0]), torch.tensor([[late - int(late)], [0.0]], dtype=torch.float64)
+    for k in range(4, 9):
+        acted = [course[k - i].expand(3, 2, 1) for i in range(5)]
+        found = _late(acted, whole, rest)
+        assert found.shape == (3, 2, 1)
+        expected = np.interp(k - late, np.arange(9), course.numpy())
+        np.testing.assert_allclose(found[:, 0, 0].numpy(), expected, rtol=1e-12)
+        np.testing.assert_allclose(found[:, 1, 0].numpy(), float(course[k]), rtol=1e-12)
+
+
+def test_errors_of_dead_time_go_beyond_a_sample() -> None:
+    """Twice what is open, and at most a quarter of the horizon."""
+    model = first_order()
+    for sd, latest in ((0.1, 0.5), (1.5, 3.0), (40.0, 5.0)):
+        open_to = model.state_dict() | {"dead_sd": torch.tensor([sd]).double()}
+        known = Identified.from_arrays(model.config(), {name: value.numpy() for name, value in open_to.items()})
+        trials = Trials.draw(known, made_signals(), 20, seed=0)
+        assert float(trials.late.max()) == latest
+        assert np.isfinite(trials.run(law_of(known, horizon=20), 1).set_points).all()
 
 
 def test_errors_of_pace_leave_a_stable_plant_stable() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -31,7 +31,8 @@ GAINS = (0, 1, -1, 1, -1, 0)
 PACES = (0, -1, 1, -1, 1, 0)
 LATE = (0, 1, 0, 1, 0, 0)
 GAIN, PACE, DEAD = 0.25, 0.15, 0.5  # least errors; larger ones of pace and dead time calm loops that need no calm
-MOST = 1.0  # of each error; of the dead time in samples
+MOST = 1.0  # of each error
+LATEST = 0.25  # of the horizon, that plants answer later at most
 BIAS = 0.2  # of half an MV's range: the largest steps of a load at the MV
 LOAD = 0.6  # scaled, over the samples of the horizon: steps of a load at the output
 DRIFT = 0.15  # of BIAS and LOAD: a sample's share of a load that walks
@@ -85,7 +86,7 @@ class Trials:
         low, high = (np.array([getattr(s, end) for s in signals.mv]) for end in ("low", "high"))
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         signs = rng.choice([-1.0, 1.0], (loops, n_mv)) if n_mv > 1 else np.ones((loops, 1))
-        gain, pace, late = _errors(model, signs)
+        gain, pace, late = _errors(model, signs, LATEST * horizon)
         # Every set point is a rest under MVs that act; a plant with another gain is given others for them.
         acting = middle + half * rng.uniform(-REACH, REACH, (HOLDS + 1, loops, n_mv))
         acting[:, LOOPS:] = middle + 0.6 * (acting[:1, LOOPS:] - middle)
@@ -165,6 +166,8 @@ class Trials:
         model, (n, loops, _), count = self.model, self.sp.shape, len(x)
         middle, n_y = torch.tensor([s.middle for s in self.signals.mv]).double(), model.n_y
         mv = self.mv0.expand(count, -1, -1)
+        whole = self.late[:, 0].long()
+        acted = [mv] * (int(whole.max()) + 2)  # the latest MVs, the last one first
         state = torch.zeros(count, loops, laws.n_state, dtype=torch.float64)
         more = torch.tensor([s.middle for s in self.signals.pv[n_y:]]).double().expand(count, loops, -1)
         dv = model.v_center[len(middle) :].expand(count, loops, -1)
@@ -173,20 +176,30 @@ class Trials:
             wanted = self.sp[k].expand(count, -1, -1)
             mv, state, _ = laws(wanted, torch.cat([y + self.noise[k], more], dim=-1), dv, mv, state)
             yield y, before, mv
-            late = mv + self.late * (before - mv)
+            acted = [mv, *acted[:-1]]
+            late = _late(acted, whole, self.late - whole[:, None])
             acting = middle + self.gain * (late - middle) + self.bias[k]
             x = self.ahead(x, torch.cat([acting, dv], dim=-1))
             x = torch.cat([x[..., :n_y] + self.load[k], x[..., n_y:]], dim=-1)
 
 
-def _errors(model: Identified, signs: Array) -> tuple[Array, Array, Array]:
+def _late(acted: Sequence[Tensor], whole: Tensor, rest: Tensor) -> Tensor:
+    """The MVs (..., 2 LOOPS, n_mv) of ``whole`` samples (2 LOOPS,) and the ``rest`` (2 LOOPS, 1) of one before."""
+    if not bool(whole.any()):
+        return acted[0] + rest * (acted[1] - acted[0])
+    past, loops = torch.stack(list(acted), dim=-3), torch.arange(len(whole))  # (..., samples, 2 LOOPS, n_mv)
+    near, far = past[..., whole, loops, :], past[..., whole + 1, loops, :]
+    return near + rest * (far - near)
+
+
+def _errors(model: Identified, signs: Array, latest: float) -> tuple[Array, Array, Array]:
     """Gains (2 LOOPS, n_mv) and paces (2 LOOPS, 1) over the model's, and how much later (2 LOOPS, 1) plants answer.
 
-    ``signs`` (2 LOOPS, n_mv) say which MVs' gains are wrong the other way round.
+    ``signs`` (2 LOOPS, n_mv) say which MVs' gains are wrong the other way round; ``latest`` are the most samples.
     """
     gain, pace, dead = (
-        likely_error(sd.numpy(), least, MOST)
-        for sd, least in ((model.gain_sd, GAIN), (model.pace_sd, PACE), (model.dead_sd, DEAD))
+        likely_error(sd.numpy(), least, most)
+        for sd, least, most in ((model.gain_sd, GAIN, MOST), (model.pace_sd, PACE, MOST), (model.dead_sd, DEAD, latest))
     )
     turned = np.tile(GAINS, 2)[:, None] * signs
     return (1 + gain) ** turned, (1 + pace) ** np.tile(PACES, 2)[:, None], dead * np.tile(LATE, 2)[:, None]

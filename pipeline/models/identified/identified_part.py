@@ -151,7 +151,8 @@ class IdentifiedPart(Part):
         unused = unused_answers(controlled, np.median(curves, axis=0) / size[:, None, None], structure, (n_cv, n_mv))
         margin = sign_margin(controlled, unused, LIKELY_SDS) if n_mv > 1 else -np.inf
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
-        open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": doubt.dead}
+        dead = np.maximum(doubt.dead, _dead_sd(selection, n_mv))
+        open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": dead}
         known = {"noise": noise, "colour": colour, "load_moves": _load_moves(fitted.model, whole), **open_to}
         model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
@@ -217,6 +218,11 @@ def _likely(selection: Selection, inputs: Sequence[Signal]) -> dict[str, Any]:
     if not selection.dead_times:
         return {}
     return {"dead_times": {s.name: list(ends) for s, ends in zip(inputs, selection.dead_times, strict=True)}}
+
+
+def _dead_sd(selection: Selection, n_mv: int) -> float:
+    """Standard deviation [periods] of the MVs' dead times between those that explain the record alike, two each way."""
+    return max(((most - least) / 4 for least, most in selection.dead_times[:n_mv]), default=0.0)
 
 
 def _unseen(mvs: Sequence[Signal], rows: ScaledRecord, scales: Scales) -> list[str]:

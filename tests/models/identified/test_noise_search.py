@@ -124,3 +124,4 @@ def test_likely_dead_times_hold_the_one_of_the_plant() -> None:
         dead = LOOPS["dead time, set points"].dead
         assert low - 1 <= dead - 1 <= high + 1
         assert low <= found["structure"]["delays"][0] <= high
+        assert found["open"]["dead_sd"][0] >= (high - low) / 4
