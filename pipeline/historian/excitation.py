@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.historian.feedback import follows
-from pipeline.historian.findings import InputReport, Verdict
+from pipeline.historian.findings import InputReport, Verdict, counted
 from pipeline.historian.first_answer import first_answer
 from pipeline.historian.linear import Linear
 from pipeline.historian.settled import certain
@@ -222,7 +222,8 @@ def _reasons(
             words = f"{i.name} follows {pv} (feedback explains {100 * share:.0f} % of its moves)"
             alone = moved_sp < FEW_MOVES
             if alone:
-                moved = f"the set points were moved {moved_sp} times only" if moved_sp else "no set point was moved"
+                few = f"the set points were moved {counted(moved_sp, 'time')} only"
+                moved = few if moved_sp else "no set point was moved"
                 words += f", and {moved}: the record shows the controller more than the plant"
             found.append((2 if alone and share > FOLLOWS_CLOSELY else 1 if alone else 0, words))
     for pair, r in correlation.items():

@@ -41,8 +41,13 @@ THOUSANDS = {  # by the decimal sign: certain ones, and those of one sign alone,
 ODD = re.compile(rf"[{MINUS}{UNSEEN}\uff0b{BLANKS}'’‘ʼ`´]|-$")  # what a plain number has not
 WITH_UNIT = r"^(?P<number>[+-]?[\d.,]*\d)(?P<unit>\s*[%°‰]\S*|\s+[^\s\d][^\s\d]*)$"
 LOOSE = re.compile(r"[+-]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?")
-# Codes of a state, as [-11059] No Good Data or Error 254: a number in brackets, or behind a word that is no limit.
-STATE = re.compile(r"\[|^\W*(?!over|under|above|below|more|less|high|low|max|min|hi\b|lo\b)[^\W\d_]{3,}", re.IGNORECASE)
+# Codes of a state, as [-11059] No Good Data or Error 254: a number in brackets before words, or one behind a word that
+# is no limit.
+LIMITS = (
+    "about|above|approx|below|circa|greater|größer|high|kleiner|less|limit|low|max|mehr|min|more|over|smaller|under|unter|"
+    r"upper|weniger|über|(?:bar|ca|hi|lo|lod|loq)\b"
+)
+STATE = re.compile(rf"^\W*(\[[+-]?\d+\]\s*[^\W\d_]|(?!{LIMITS})[^\W\d_]{{3,}})", re.IGNORECASE)
 
 Codes = NDArray[np.uint8]
 

@@ -107,15 +107,17 @@ def _left_open(part: Mapping[str, Any], mvs: Sequence[str]) -> tuple[str, ...]:
 def _dead_times(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
     """The inputs whose dead time a record in closed loop hardly tells, and how somebody says what it is."""
     plant, found = evidence.case.plant_class, (part.get("open") or {}).get("dead_times") or {}
-    wide = {name: plant.period_s * np.array(ends) for name, ends in found.items() if ends[1] - ends[0] >= APART}
+    wide = {name: plant.period_s * np.array(of) for name, of in found.items() if of[2] - of[1] >= APART}
     if not wide:
         return ()
-    spans = " and ".join(f"from {number(low)} to {number(high)} s of {name}" for name, (low, high) in wide.items())
-    first = f"{plant.sp_signals[0].name}/{next(iter(wide))}=dead 30..50"
+    spans = (
+        f"from {number(low)} to {number(high)} s of {name} (the model has {number(own)} s)"
+        for name, (own, low, high) in wide.items()
+    )
+    pairs = " and ".join(f'--known "{signal.name}/{next(iter(wide))}=dead 30..50"' for signal in plant.sp_signals)
     return (
-        f"Dead times {spans} explain the record alike, and the model has the middle of them. If you know the true one, "
-        f'say it in column `known` of the table of tags, or as --known "{first}" (in s): the controllers can then be '
-        "quicker.",
+        f"Dead times {' and '.join(spans)} explain the record alike. If you know the true one, say it in seconds, as "
+        f"{pairs} or in column `known` of the table of tags: the controllers can then be quicker.",
     )
 
 

@@ -155,7 +155,7 @@ def test_the_report_asks_for_a_dead_time_that_the_record_does_not_tell(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     certain = {"gain_sd": [0.1, 0.1], "pace_sd": [0.05], "dead_sd": [0.3]}
-    part = {**PART, "open": certain | {"dead_times": {"u0": [0, most], "u1": [1, 1]}}}
+    part = {**PART, "open": certain | {"dead_times": {"u0": [1, 0, most], "u1": [1, 1, 1]}}}
     models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
     found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
     assert found is not None

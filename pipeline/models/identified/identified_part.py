@@ -184,7 +184,7 @@ class IdentifiedPart(Part):
             | ({"sign_margin": dict.fromkeys(names[:n_cv], margin)} if np.isfinite(margin) else {})
             | said
             | ({"held": dict(source.held)} if source.held else {}),
-            "open": {name: values.tolist() for name, values in open_to.items()} | _likely(selection, inputs),
+            "open": {name: values.tolist() for name, values in open_to.items()} | _likely(problem, selection, inputs),
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],
             "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
             "warnings": warnings,
@@ -213,16 +213,21 @@ def _proof(
     return {"answers": figures["answers"], "one_step": foreseen(problem, chosen, list(runs), scales.y_scale)}
 
 
-def _likely(selection: Selection, inputs: Sequence[Signal]) -> dict[str, Any]:
-    """Of each input the least and the most periods of dead time that explain a record in closed loop alike."""
-    if not selection.dead_times:
-        return {}
-    return {"dead_times": {s.name: list(ends) for s, ends in zip(inputs, selection.dead_times, strict=True)}}
+def _likely(problem: Problem, selection: Selection, inputs: Sequence[Signal]) -> dict[str, Any]:
+    """Of each MV the periods of dead time of the model, and the least and the most that explain the record alike.
+
+    Those are left out of which a dead time is known, or that they move nothing.
+    """
+    stated = {p.input for p in problem.known.pairs if p.delays is not None} | set(problem.known.silent)
+    rows = zip(inputs[: problem.n_mv], selection.chosen.structure.delays, selection.dead_times, strict=False)
+    found = {s.name: [int(d), *map(int, ends)] for j, (s, d, ends) in enumerate(rows) if j not in stated}
+    return {"dead_times": found} if found else {}
 
 
 def _dead_sd(selection: Selection, n_mv: int) -> float:
-    """Standard deviation [periods] of the MVs' dead times between those that explain the record alike, two each way."""
-    return max(((most - least) / 4 for least, most in selection.dead_times[:n_mv]), default=0.0)
+    """Standard deviation [periods] of the MVs' dead times: half the way to the farthest one that is as likely."""
+    rows = zip(selection.chosen.structure.delays[:n_mv], selection.dead_times, strict=False)
+    return max((max(most - d, d - least, 0) / 2 for d, (least, most) in rows), default=0.0)
 
 
 def _unseen(mvs: Sequence[Signal], rows: ScaledRecord, scales: Scales) -> list[str]:

@@ -47,6 +47,9 @@ LIKELY = 2.0
 HALF = 0.5
 """Share of an answer's last value at which its rise is compared with its dead time."""
 
+UNEVEN = 3.0
+"""Nats that count as one of the weight of a dead time: fits of neighbouring ones end as far apart by chance."""
+
 FAR = 10.0
 """Nats by which a dead time is worse, from which on no farther one is tried."""
 
@@ -101,10 +104,15 @@ def _of_all_rows(problem: Problem, trial: Trial) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
+def _finite(trial: Trial) -> bool:
+    return all(np.isfinite(f.held_out) and np.isfinite(f.trained) for f in trial.fits.values())
+
+
 def likely_dead_times(problem: Problem, linear: Sequence[Trial]) -> list[tuple[int, int]]:
     """Of each input the least and the most periods of dead time of models that are as likely as the best one."""
     least = min(t.against for t in linear)
-    own = [t for t in linear if t.against == least and t.structure.noise == "all"] or linear[:1]
+    own = [t for t in linear if t.against == least and t.structure.noise == "all" and _finite(t)]
+    own = own or list(linear[:1])
     best = min(own, key=lambda t: behind(problem, t, own[0]))
     found = [t.structure.delays for t in own if behind(problem, t, best) <= LIKELY]
     return [(min(of), max(of)) for of in zip(*found, strict=True)]
@@ -129,7 +137,9 @@ class NoiseSearch:
         """
         offered = [n for n in orders if n <= LARGEST]
         scanned, middle = self._scanned(offered[:PLAIN])
-        delays = list(dict.fromkeys([middle, *(t.structure.delays for t in scanned)]))[:LIKELIEST]
+        none = next(s.delays for s, _ in self.linears.starts)
+        likely = dict.fromkeys([middle, *(t.structure.delays for t in scanned)])
+        delays = list(dict.fromkeys([*list(likely)[:LIKELIEST], none]))
         structures = [
             Structure("balanced", n, (0, 0), d, noise=noise) for n in offered for d in delays for noise in FITTED
         ]
@@ -159,18 +169,21 @@ class NoiseSearch:
 
         A load hides how an answer begins, and models of few states imitate a dead time by lags: the rows then tell no
         dead time from many others, and the first ones of an impulse response least of all. All MVs' dead times are
-        moved together, then each one's, then those of the measured disturbances.
+        moved together, then each one's, then those of the measured disturbances; not those of inputs that are known to
+        move nothing.
         """
         problem = self.rounds.problem
-        n_v, n_mv = problem.data.v.shape[1], problem.n_mv
-        none, *later = dict.fromkeys(s.delays for s, _ in self.linears.starts)
-        at = later[-1] if later else none
-        trials = self.ranked(self._fitted(list(dict.fromkeys([none, at])), orders))
-        alone = [(j,) for j in range(n_v) if n_mv > 1 or j >= n_mv]
-        for inputs in (tuple(range(n_mv)), *alone):
-            if not trials:
-                break
-            trials, at = self._along(inputs, at, orders if len(inputs) == n_mv else [trials[0].structure.order], trials)
+        heard = [j for j in range(problem.data.v.shape[1]) if j not in problem.known.silent]
+        mvs = [j for j in heard if j < problem.n_mv]
+        seen = list(dict.fromkeys(s.delays for s, _ in self.linears.starts))
+        trials = self.ranked(self._fitted(seen, orders))
+        if not trials:
+            return trials, seen[-1]
+        at = next(iter(self._by_dead_time(trials)))
+        if mvs:
+            trials, at = self._along(mvs, at, orders, trials)
+        for j in (j for j in heard if len(mvs) > 1 or j not in mvs):
+            trials, at = self._along([j], at, [trials[0].structure.order], trials)
         return trials, at
 
     def _along(
@@ -178,31 +191,39 @@ class NoiseSearch:
     ) -> tuple[list[Trial], tuple[int, ...]]:
         """(trials and those with dead times of some inputs beside ``at``, ranked; the median of these dead times).
 
-        Each counts by its likelihood, and the less the more of its answer's rise it makes: a record that tells nothing
-        tells of no dead time. The likeliest one of many alike is chance, and a law that trusts one too early swings on
-        the plant.
+        Each counts by its likelihood, by its distance from its neighbours, and by the square of the share of its
+        answer's rise that is no dead time: where a record tells nothing, dead time is a quarter of the rise. The
+        likeliest one of many alike is chance, and a law that trusts one too early swings on the plant.
         """
-        known, places = self.rounds.problem.known, list(inputs)
+        known = self.rounds.problem.known
+
+        def rows(d: tuple[int, ...]) -> float:
+            return sum(d[j] for j in inputs) / len(inputs)
+
         line, sides, tried = {at}, [-1, 1], {t.structure.delays for t in trials}
         for aside in ASIDE:
             of_side = {}
             for side in sides:
-                moved = ([max(d + side * n, 0) if j in places else d for j, d in enumerate(at)] for n in aside)
+                moved = ([max(d + side * n, 0) if j in inputs else d for j, d in enumerate(at)] for n in aside)
                 of_side[side] = {known.delays(d) for d in moved} - line
                 line |= of_side[side]
-            trials = self.ranked([*trials, *self._fitted(sorted(line - tried), orders)])
+            nearest = sorted(line - tried, key=lambda d: (abs(rows(d) - rows(at)), d))
+            trials = self.ranked([*trials, *self._fitted(nearest, orders)])
             tried |= line
             costs = self._by_dead_time(trials)
             near = {d for d, (cost, _) in costs.items() if cost <= FAR}
             sides = [side for side in sides if near & of_side[side]]
+            if not sides:
+                break
         costs = {d: found for d, found in self._by_dead_time(trials).items() if d in line}
-        late = {d: float(sum(d[j] for j in places)) for d in costs}
-        ordered = sorted(costs, key=lambda d: late[d])
+        ordered = sorted(costs, key=rows)
         if len(ordered) < 2:
             return trials, (ordered or [at])[0]
         n_y = self.rounds.problem.data.y.shape[1]
-        prior = np.gradient([late[d] for d in ordered]) * [_of_lags(costs[d][1], places, n_y) for d in ordered]
-        weights = np.cumsum(prior * np.exp([-costs[d][0] for d in ordered]))
+        apart = np.gradient([rows(d) for d in ordered])
+        lags = np.array([_of_lags(costs[d][1], inputs, n_y) for d in ordered])
+        cost = np.array([costs[d][0] for d in ordered])
+        weights = np.cumsum(apart * lags**2 * np.exp((cost.min() - cost) / UNEVEN))
         return trials, ordered[int(np.searchsorted(weights, 0.5 * weights[-1]))]
 
     def _by_dead_time(self, trials: Sequence[Trial]) -> dict[tuple[int, ...], tuple[float, Trial]]:
@@ -219,15 +240,17 @@ class NoiseSearch:
         return found
 
     def _fitted(self, delays: Sequence[tuple[int, ...]], orders: Sequence[int]) -> list[Trial]:
-        """The fits of all folds with some dead times and orders, where none explodes."""
-        self.linears.starts.update(self.rounds.starts([Structure("balanced", 0, (0, 0), d) for d in delays]))
+        """The fits of all folds with some dead times and orders, where none explodes; the first that are affordable."""
         structures = [Structure("balanced", n, (0, 0), d, noise="all") for d in delays for n in orders]
         if not structures:
             return []
         affordable = self.rounds.affordable(structures, ITERATIONS * len(self._folds), 0.3)
+        begun = {s.delays for s, _ in self.linears.starts}
+        new = [d for d in dict.fromkeys(s.delays for s in affordable) if d not in begun]
+        self.linears.starts.update(self.rounds.starts([Structure("balanced", 0, (0, 0), d) for d in new]))
         tasks = [self._task(s, k) for s in affordable for k in self._folds]
         trials = self.rounds.trials(tasks, "dead times")[0]
-        return [t for t in trials if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
+        return [t for t in trials if len(t.fits) == len(self._folds) and _finite(t)]
 
     def _task(self, structure: Structure, fold: int) -> Task:
         return Task(structure, fold, ITERATIONS, start=self.linears.start(structure, fold))

@@ -154,8 +154,8 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     search = replace(search, rounds=replace(rounds, problem=problem))
     networks = search.networks(linear, units)
     best = best_of(networks)
-    # Nothing is gained by what the linear model gave away to settle.
-    rival = min((ranked[0], linear[0]), key=lambda t: t.rank)
+    # Nothing is gained by what the linear model gave away to settle, or for the middle dead time.
+    rival = min((*ranked[:2], linear[0]), key=lambda t: t.rank)
     gained = 0.0 if best is None else nats(rounds.problem, rival, best)
     every, spent = [*linear, *networks], rounds.budget.spent
     alike = likely_dead_times(problem, ranked)
@@ -185,10 +185,6 @@ def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
         if settling is not None:
             return [settling, *(t for t in linear if t is not settling)]
     return linear
-
-
-def _trained(trial: Trial) -> float:
-    return trial.of_fold(trial.folds[0])[0].trained
 
 
 def _drift(problem: Problem, trial: Trial) -> Drift:
