@@ -20,7 +20,9 @@ class Fitted(Controller):
     """A controller that gets its own PVs and measured disturbances out of a loop's, by name.
 
     Its ``manifest`` has all signals of the loop, so that whoever reads, judges, shows or writes down a scan does so as
-    before; those that the controller reads have the ranges for which it was proven. ``inner`` is the controller itself.
+    before; those that the controller reads have the ranges for which it was proven, and the MVs those of the actuator.
+    ``inner`` is the controller itself, whose MVs may have narrower ones: it never commands more, and refuses a step
+    from an MV that stands further outside than one move.
     """
 
     def __init__(self, inner: Controller, loop: Manifest) -> None:
@@ -51,8 +53,8 @@ def fitted(controller: Controller, loop: Manifest) -> Controller:
     """``controller`` for a loop that reads the signals of ``loop``: itself where it reads all of them.
 
     LoopError where it cannot take over there: another period, a signal that the loop does not read, another order of
-    what it controls, other set points or MVs. Of the MVs ranges and values count too: they belong to the actuator. The
-    ranges of set points and PVs say where a controller was proven, and may be others.
+    what it controls, other set points or MVs. The MVs' values must be the same, and their ranges within the loop's:
+    these belong to the actuator. The ranges of set points and PVs say where a controller was proven, and may be others.
     """
     require_fits(controller.manifest, loop)
     return controller if _seen_as(controller.manifest, loop) == controller.manifest else Fitted(controller, loop)
@@ -74,12 +76,16 @@ def _basics(own: Manifest, loop: Manifest) -> Iterator[str]:
 
 
 def _steered(own: Manifest, loop: Manifest) -> Iterator[str]:
-    """Set points and MVs, which must be the same."""
-    for name, words, ranged in (("sp", "set points", False), ("mv", "MVs", True)):
-        ours, its = loop.signals(name), own.signals(name)
-        if [_what(s, ranged) for s in ours] != [_what(s, ranged) for s in its]:
-            same = "name, unit, range and order" if ranged else "name, unit and order"
-            yield f"its {words} are {_shown(its)}, the loop's are {_shown(ours)}, and both must be the same in {same}"
+    """Set points and MVs, which must be the same; MVs may have a part of the loop's range."""
+    if [_what(s) for s in own.sp] != [_what(s) for s in loop.sp]:
+        its, ours = _shown(own.sp), _shown(loop.sp)
+        yield f"its set points are {its}, the loop's are {ours}, and both must be the same in name, unit and order"
+    same = [(*_what(s), s.values) for s in own.mv] == [(*_what(s), s.values) for s in loop.mv]
+    if not (same and all(o.low <= s.low and s.high <= o.high for s, o in zip(own.mv, loop.mv, strict=True))):
+        yield (
+            f"its MVs are {_shown(own.mv)}, the loop's are {_shown(loop.mv)}, and both must be the same in name, unit, "
+            "values and order, with ranges within the loop's"
+        )
 
 
 def _measured(own: Manifest, loop: Manifest) -> Iterator[str]:
@@ -99,7 +105,8 @@ def _seen_as(own: Manifest, loop: Manifest) -> Manifest:
     inputs = tuple(n for n in INPUTS if n in own.inputs or (n == "dv" and n in loop.inputs))
     if set(inputs) == set(own.inputs):
         inputs = own.inputs
-    return replace(own, pv=_ranged(loop.pv, own.pv), dv=_ranged(loop.dv, own.dv), inputs=inputs)
+    mv = tuple(replace(s, low=o.low, high=o.high) for s, o in zip(own.mv, loop.mv, strict=True))
+    return replace(own, pv=_ranged(loop.pv, own.pv), mv=mv, dv=_ranged(loop.dv, own.dv), inputs=inputs)
 
 
 def _ranged(loop: Sequence[Signal], own: Sequence[Signal]) -> tuple[Signal, ...]:
@@ -119,8 +126,8 @@ def _picked(values: ArrayLike | None, places: Sequence[int], loop: Sequence[Sign
     return np.asarray(vector[places])
 
 
-def _what(s: Signal, ranged: bool = False) -> tuple[object, ...]:
-    return (s.name, s.unit, s.low, s.high, s.values) if ranged else (s.name, s.unit)
+def _what(s: Signal) -> tuple[object, ...]:
+    return s.name, s.unit
 
 
 def _shown(signals: Sequence[Signal]) -> str:

@@ -177,3 +177,32 @@ def test_a_host_s_own_guards_stay_and_its_maker_is_asked_again(made: Made) -> No
     loop.swap(new, trial=1)
     loop.scan(one)
     assert asked == [old.manifest, new.manifest]
+
+
+def test_one_that_commands_a_part_of_the_actuators_range_takes_over_and_keeps_to_it(made: Made) -> None:
+    """As a controller of an own plant does, whose model has a gain that turns: by hand the MV has all of its range."""
+    old = made(deaf, SIGNALS)
+    part = made(deaf, replace(SIGNALS, mv=(replace(SIGNALS.mv[0], low=60.0),)))
+    loop = ControlLoop(old, sp=1.0, mv=40.0, mode=Mode.AUTO)
+
+    def scan(mv: float) -> float:
+        return float(loop.scan(Sample(np.array([0.8, 300.0]), np.array([mv]), np.array([1.0]))).mv[0])
+
+    loop.swap(part, trial=1)
+    assert scan(40.0) == pytest.approx(52.0)  # on trial
+    assert scan(52.0) == pytest.approx(60.0)
+    assert loop.controller.sha256 == part.sha256
+    assert (loop.manifest.mv[0].low, loop.manifest.mv[0].high) == (0.0, 100.0)
+    loop.set_mode(Mode.MANUAL)
+    loop.set_mv([20.0])
+    assert scan(60.0) == 20.0
+    loop.set_mode(Mode.AUTO)
+    assert scan(20.0) == pytest.approx(60.0)
+    assert loop.replaced is old
+    loop.swap(old, trial=1)
+    assert scan(60.0) == pytest.approx(60.0)
+    assert scan(60.0) == pytest.approx(52.0)
+    # A wider one, or one with other values, belongs to another actuator.
+    wide = made(deaf, replace(SIGNALS, mv=(replace(SIGNALS.mv[0], high=101.0),)))
+    with pytest.raises(LoopError, match="ranges within the loop's"):
+        loop.swap(wide, trial=1)
