@@ -397,8 +397,8 @@ def test_others_that_do_not_fit_are_named(
 
     others = {
         "its period is 1 s, the loop's is 0.5 s": replace(SIGNALS, period_s=1.0),
-        r"MVs are valve \[%\] 0..90, the loop's are valve \[%\] 0..100": replace(
-            SIGNALS, mv=(Signal("valve", "%", 0.0, 90.0),)
+        r"MVs are valve \[%\] 0..110, the loop's are valve \[%\] 0..100": replace(
+            SIGNALS, mv=(Signal("valve", "%", 0.0, 110.0),)
         ),
         r"measured disturbances are heat \[kW\] 0..3, the loop's are inflow": replace(
             SIGNALS, dv=(Signal("heat", "kW", 0.0, 3.0),)
@@ -406,8 +406,8 @@ def test_others_that_do_not_fit_are_named(
         r"PVs are T .* have no others, and must begin with those that are controlled": replace(
             SIGNALS, pv=SIGNALS.pv[1:]
         ),
-        r"its period is 2 s, .*; its set points are T .*; its MVs are valve .* 0..90, .*; its PVs are T": Signals(
-            2.0, SIGNALS.pv[1:], SIGNALS.pv[1:], SIGNALS.dv, (Signal("valve", "%", 0.0, 90.0),)
+        r"its period is 2 s, .*; its set points are T .*; its MVs are valve .* 0..110, .*; its PVs are T": Signals(
+            2.0, SIGNALS.pv[1:], SIGNALS.pv[1:], SIGNALS.dv, (Signal("valve", "%", 0.0, 110.0),)
         ),
         r"PVs are level .*, T \[degC\]": replace(SIGNALS, pv=(SIGNALS.pv[0], replace(SIGNALS.pv[1], unit="degC"))),
     }
