@@ -21,8 +21,8 @@ class Fitted(Controller):
 
     Its ``manifest`` has all signals of the loop, so that whoever reads, judges, shows or writes down a scan does so as
     before; those that the controller reads have the ranges for which it was proven, and the MVs those of the actuator.
-    ``inner`` is the controller itself, whose MVs may have narrower ones: it never commands more, and refuses a step
-    from an MV that stands further outside than one move.
+    ``inner`` is the controller itself, whose MVs may have narrower ones: from where an MV stands outside of them it
+    goes there by its largest move a period.
     """
 
     def __init__(self, inner: Controller, loop: Manifest) -> None:
@@ -36,16 +36,22 @@ class Fitted(Controller):
         self, *, sp: ArrayLike, pv: ArrayLike, mv_applied: ArrayLike, state: ArrayLike, dv: ArrayLike | None = None
     ) -> Step:
         """One step, on all PVs and measured disturbances of the loop."""
-        return self.inner.step(
+        step = self.inner.step(
             sp=sp,
             pv=_picked(pv, self._pv, self.manifest.pv, "pv"),
             mv_applied=mv_applied,
             state=state,
             dv=_picked(dv, self._dv, self.manifest.dv, "dv") if "dv" in self.inner.manifest.inputs else None,
         )
+        applied = np.asarray(mv_applied, dtype=np.float64).reshape(step.mv.shape)
+        mv = [
+            s.toward(min(max(float(at), s.low), s.high), float(wanted))
+            for s, at, wanted in zip(self.manifest.mv, applied, step.mv, strict=True)
+        ]
+        return step._replace(mv=np.array(mv))
 
     def warm(self) -> None:
-        """As the controller itself."""
+        """Compute a first step, as ``Controller.warm`` does."""
         self.inner.warm()
 
 

@@ -206,3 +206,22 @@ def test_one_that_commands_a_part_of_the_actuators_range_takes_over_and_keeps_to
     wide = made(deaf, replace(SIGNALS, mv=(replace(SIGNALS.mv[0], high=101.0),)))
     with pytest.raises(LoopError, match="ranges within the loop's"):
         loop.swap(wide, trial=1)
+
+
+def test_it_goes_into_its_part_of_the_range_by_its_largest_move_a_period(made: Made) -> None:
+    old = made(deaf, SIGNALS)
+    part = made(deaf, replace(SIGNALS, mv=(replace(SIGNALS.mv[0], low=60.0, max_move=5.0),)))
+    loop = ControlLoop(old, sp=1.0, mv=40.0, mode=Mode.AUTO)
+
+    def scan(mv: float) -> float:
+        return float(loop.scan(Sample(np.array([0.8, 300.0]), np.array([mv]), np.array([1.0]))).mv[0])
+
+    loop.swap(part, trial=1)
+    assert scan(40.0) == pytest.approx(52.0)  # on trial
+    assert loop.successor is None
+    for mv, expected in ((47.0, 52.0), (52.0, 57.0), (57.0, 60.0), (62.0, 60.0), (60.0, 60.0)):
+        assert scan(mv) == pytest.approx(expected)
+    # A read-back beyond the actuator's range counts as its end.
+    seat, one = fitted(part, old.manifest), sample()
+    step = seat.step(sp=1.0, pv=one.pv[:2], dv=one.dv[:1], mv_applied=-3.0, state=seat.cold_state())
+    assert step.mv.tolist() == pytest.approx([5.0])
