@@ -43,8 +43,9 @@ class Doubts(NamedTuple):
     def __str__(self) -> str:
         """In words."""
         gain = " to ".join(f"{g:g}" for g in sorted({round(1 + g, 2) for g in (min(self.gain), max(self.gain))}))
-        late = f"{self.dead:.2g} period{'s' * (self.dead != 1)} later"
-        return f"gain {gain} times as high, {1 + self.pace:.3g} times as slow, {late}; or lower and faster by as much"
+        slow = f"gain {gain} times as high, {1 + self.pace:.3g} times as slow, {_periods(LEAST_DEAD)} later"
+        farthest = f"; or else as the model, {_periods(self.dead)} later" * (self.dead > LEAST_DEAD)
+        return f"{slow}; or lower and faster by as much{farthest}"
 
 
 class OwnPlant(IdentifiedPlant):
@@ -105,13 +106,24 @@ class OwnPlant(IdentifiedPlant):
 
 
 def errors_of(plant: OwnPlant) -> list[dict[str, float]]:
-    """Parameters of the spoilt plants: slow with a high gain and a longer dead time, fast with a low gain."""
+    """Parameters of the spoilt plants: slow and late with a high gain; fast with a low gain; and late alone.
+
+    The last one stands for the dead times that explain the record as the model's does: a model with one has about the
+    same gain and pace. There is none where they end within ``LEAST_DEAD``.
+    """
     d = plant.doubts
     high = {f"gain_{s.name}": 1 + error for s, error in zip(plant.mv_signals, d.gain, strict=True)}
-    return [
-        {**high, "time_constant": 1 + d.pace, "dead_time": d.dead},
+    found = [
+        {**high, "time_constant": 1 + d.pace, "dead_time": LEAST_DEAD},
         {**{name: 1 / gain for name, gain in high.items()}, "time_constant": 1 / (1 + d.pace), "dead_time": 0.0},
     ]
+    late = dict.fromkeys(high, 1.0) | {"time_constant": 1.0, "dead_time": d.dead}
+    return [*found, late] if d.dead > LEAST_DEAD else found
+
+
+def _periods(count: float) -> str:
+    """A number of periods."""
+    return f"{count:.2g} period{'s' * (count != 1)}"
 
 
 def lessened(errors: Mapping[str, float], share: float) -> dict[str, float]:

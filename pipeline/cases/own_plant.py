@@ -134,8 +134,8 @@ class OwnCase(OwnEnsemble):
 
     @property
     def _pairs(self) -> list[tuple[int, OwnPlant, int]]:
-        """Each held-out seed with its plant, and by turns with one of the errors that a plant may have."""
-        return [(seed, self.members[i % len(self.members)], i % 2) for i, seed in enumerate(self.held_out_seeds)]
+        """Each held-out seed with its plant, and its place: by turns these take sides and errors."""
+        return [(seed, self.members[i % len(self.members)], i) for i, seed in enumerate(self.held_out_seeds)]
 
     @cached_property
     def _held_out(self) -> tuple[Scenario, ...]:
@@ -146,7 +146,7 @@ class OwnCase(OwnEnsemble):
     def _scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         members, pairs = self.members, self._pairs
         errors = errors_of(self._nominal)
-        spoilt = [self._spoilt(p, s, errors[i]) for s, p, i in pairs]
+        spoilt = [self._spoilt(p, s, errors[i % len(errors)]) for s, p, i in pairs]
         less = sorted({share for _, share in spoilt if share < 1})
         title = f"Set points, on such models gone wrong: {self._doubts}"
         if less:
@@ -157,8 +157,8 @@ class OwnCase(OwnEnsemble):
         return {
             "held_out": self._held_out,
             SPOILT: tuple(replace(test, title=title) for test, _ in spoilt),
-            **self._loads([(p, i == 0) for _, p, i in pairs]),
-            **self._measured([(p, i == 0) for _, p, i in pairs]),
+            **self._loads([(p, i % 2 == 0) for _, p, i in pairs]),
+            **self._measured([(p, i % 2 == 0) for _, p, i in pairs]),
             **self._daily(members),
         }
 

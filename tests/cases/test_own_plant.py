@@ -126,10 +126,13 @@ def test_errors_of_spoilt_plants_grow_with_what_the_record_leaves_open(heater: O
     case = own_case("heater")
     assert isinstance(case, OwnCase)
     assert case.plant.parameters({"dead_time": 2.4}).tolist() == [1.0, 1.0, 2.4, 0.0]
-    slow, fast = (dict(t.changes) for t in case.scenarios()["spoilt"][:2])
-    assert [float(values[0]) for values in slow.values()] == pytest.approx([1.4, 1.6, 2.4])
+    slow, fast, late = (dict(t.changes) for t in case.scenarios()["spoilt"])
+    assert [float(values[0]) for values in slow.values()] == pytest.approx([1.4, 1.6, 1.0])
     assert [float(values[0]) for values in fast.values()] == pytest.approx([1 / 1.4, 1 / 1.6, 0.0])
-    assert "gain 1.4 times as high, 1.6 times as slow, 2.4 periods later" in case.scenarios()["spoilt"][0].title
+    assert [float(values[0]) for values in late.values()] == pytest.approx([1.0, 1.0, 2.4])
+    assert "1 period later" in case.scenarios()["spoilt"][0].title
+    assert "2.4 periods later" in case.scenarios()["spoilt"][0].title
+    assert len(case.plant.variations()) == 1 + 3
 
 
 @pytest.mark.parametrize(("sd", "error"), [(0.0, 0.25), (0.2, 0.4), (9.0, 1.0)])

@@ -584,6 +584,10 @@ def test_errors_of_dead_time_go_beyond_a_sample() -> None:
         known = Identified.from_arrays(model.config(), {name: value.numpy() for name, value in open_to.items()})
         trials = Trials.draw(known, made_signals(), 20, seed=0)
         assert float(trials.late.max()) == latest
+        farthest = trials.late[:, 0] > 0.5
+        assert farthest.sum() == 2 * (latest > 0.5)
+        assert trials.gain[farthest].eq(1.0).all()
+        assert trials.pace[farthest].eq(1.0).all()
         assert np.isfinite(trials.run(law_of(known, horizon=20), 1).set_points).all()
 
 
