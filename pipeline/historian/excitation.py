@@ -142,7 +142,7 @@ def _input(
     known: Mapping[str, Spectrum],
     certain_of: Mapping[str, Collection[int]],
 ) -> InputReport:
-    """What input ``i`` with the values u (n,) did, and what answered; ``certain_of`` each PV some settling times."""
+    """The report on input ``i`` with the values u (n,) and on what answers; ``certain_of`` gives settling times by PV."""
     moves = moves_of(u, record.run)
     span = float(np.ptp(u)) if len(u) else 0.0
     still = np.abs(np.diff(u)) <= 1e-9 * span if span > 0 else np.ones(max(len(u) - 1, 1))
@@ -180,7 +180,7 @@ def _input(
 
 
 def _settling(model: Linear, n: int) -> dict[int, int]:
-    """Of the inputs that the PV answers to, of n, in how many rows it settles; 0 where it does not."""
+    """Rows in which the PV settles after each of n inputs that it answers to; 0 where it does not."""
     return {i: model.settling(i) for i in range(n) if model.strength[i] > SEEN}
 
 

@@ -25,13 +25,14 @@ from pipeline.historian.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag
 from pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (
-    (r"(mode|md|auto)$", "mode"),
-    (r"(^|[ ._:/-])(sp|spt|setpoint|set point|sollwert|w)([ ._:/-]|$)", "sp"),
-    (r"(^|[ ._:/-])(op|out|mv|co|valve|stellwert|y)([ ._:/-]|$)", "mv"),
-    (r"(^|[ ._:/-])(pv|cv|me|meas|istwert|x)([ ._:/-]|$)", "pv"),
+    (r"(mode|modus|betriebsart|md|auto)$", "mode"),
+    (r"(^|[ ._:/-])(sp|spt|sv|set[ _-]?(point|value|pt)|target|soll(wert)?|consigne|consigna|w)([ ._:/-]|$)", "sp"),
+    (r"(^|[ ._:/-])(op|out(put)?|mv|co|lmn|valve|stell(wert|gr(ö|oe)(ß|ss)e)|y)([ ._:/-]|$)", "mv"),
+    (r"(^|[ ._:/-])(pv|cv|me|meas|ist(wert)?|x)([ ._:/-]|$)", "pv"),
 )
 ATTRIBUTE = re.compile(r"([ ._:/-](?:mode|sp|op|out|mv|co|pv))[./#](cv|f_cv|value|val|actual)$", re.IGNORECASE)
 """The current value of a parameter, as SP.CV and MODE.ACTUAL: the parameter's name says what it is."""
+CONTROL_VARIABLE = re.compile(r"[ ._:/-]cv$", re.IGNORECASE)
 FLOW = re.compile(
     r"flow|flu(ss|ß)|(zu|ab|aus|ein)lauf|durchsatz|feed|discharge|throughput|d[ée]bit|caudal|portata"
     r"|^f[a-z]{0,3}[ _-]?[0-9]",
@@ -67,7 +68,7 @@ LOOP = re.compile(r"^(?P<loop>.*?)[ ._:/-]+[A-Za-z ]+$")
 def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
     """One guess for every column, in the order of the file."""
     found = [_guess(s, units.get(name, "")) for name, s in export.series.items()]
-    found = _flows_without_loop([_cascaded(g, found) for g in found])
+    found = _flows_without_loop([_cascaded(_output(g, found), found) for g in found])
     if not any(g.tag.role == "mv" for g in found):  # names say nothing: what moves in steps may be one
         moved = [g for g in found if not g.tag.role and g.look is Look.STEPS]
         moved = [g for g in moved if not _is_flow(g)] or moved  # a feed that others set, where a valve is there
@@ -124,6 +125,16 @@ def _flows_without_loop(found: Sequence[Guess]) -> list[Guess]:
         return list(found)
     note = "a flow without a loop of its own: role pv if it is to be controlled"
     return [g.as_role("", note) if g in alone else g for g in found]
+
+
+def _output(guess: Guess, found: Sequence[Guess]) -> Guess:
+    """The guess; an MV where it is the CV of a loop with a PV and no output: some systems call the output so."""
+    loop = loop_of(guess.tag.tag)
+    if guess.tag.role != "pv" or not loop or not CONTROL_VARIABLE.search(_parameter(guess.tag.tag)):
+        return guess
+    others = [g.tag for g in found if g is not guess and loop_of(g.tag.tag) == loop]
+    is_output = any(t.role == "pv" for t in others) and not any(t.role == "mv" for t in others)
+    return guess.as_role("mv", "guessed: the loop has a PV beside it") if is_output else guess
 
 
 def _cascaded(guess: Guess, found: Sequence[Guess]) -> Guess:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,9 @@ from pipeline.historian.tags import Tag
 from pipeline.metrics import Array
 from pipeline.records.set_points import SetPoints
 
-AUTOMATIC = re.compile(r"a|aut.*|r?cas.*|kas.*", re.IGNORECASE)  # names of modes in which a controller moves the MV
-MANUAL = re.compile(r"m|i?man.*|hand", re.IGNORECASE)  # and in which a person does
+AUTOMATIC = re.compile(r"a|aut.*|[abcr]?cas.*|kas.*|closed", re.IGNORECASE)  # words of modes: a controller moves the MV
+MANUAL = re.compile(r"m|i?man.*|h|hand.*|open", re.IGNORECASE)  # a person does, whatever else the mode's name says
+WORDS = re.compile(r"[\W\d_]+")  # between the words of a mode's name, as in 2-AUTO and Local.Man
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +46,8 @@ def loops(
             continue
         mv = _partner(sp, mvs, -1)
         rows = (code == 0) & ~np.isnan(grid.value[sp.tag])
-        auto = _named(AUTOMATIC, grid.value[mode.tag], modes[mode.tag]) if mode is not None else None
-        hand = _named(MANUAL, grid.value[mode.tag], modes[mode.tag]) if mode is not None else None
+        auto = _rows_of(automatic, grid.value[mode.tag], modes[mode.tag]) if mode is not None else None
+        hand = _rows_of(by_hand, grid.value[mode.tag], modes[mode.tag]) if mode is not None else None
         known = auto is not None and bool(np.any(rows & auto))
         if auto is not None and known:
             rows = rows & auto
@@ -54,8 +55,8 @@ def loops(
             continue
         kept = np.flatnonzero(rows)
         piece = grid.piece[rows] + np.cumsum(np.diff(kept, prepend=kept[0] - 1) > 1)
-        own, by_hand = tuple(mvs) if mv is None else (mv,), hand is not None and bool(hand[rows].all())
-        yield LoopRows(sp, pv, own, mv is not None, known, by_hand, rows, piece)
+        own, manual = tuple(mvs) if mv is None else (mv,), hand is not None and bool(hand[rows].all())
+        yield LoopRows(sp, pv, own, mv is not None, known, manual, rows, piece)
 
 
 def set_points(
@@ -80,7 +81,17 @@ def _partner(sp: Tag, tags: Sequence[Tag], place: int) -> Tag | None:
     return tags[place] if 0 <= place < len(tags) else None
 
 
-def _named(kind: re.Pattern[str], mode: Array, names: Sequence[str]) -> NDArray[np.bool_] | None:
+def by_hand(mode: str) -> bool:
+    """Whether the name of a mode says that a person moves the MV."""
+    return any(MANUAL.fullmatch(word) for word in WORDS.split(mode))
+
+
+def automatic(mode: str) -> bool:
+    """Whether the name of a mode says that a controller moves the MV."""
+    return not by_hand(mode) and any(AUTOMATIC.fullmatch(word) for word in WORDS.split(mode))
+
+
+def _rows_of(kind: Callable[[str], bool], mode: Array, names: Sequence[str]) -> NDArray[np.bool_] | None:
     """Rows (n,) whose mode has a name of a kind; None where no mode of the tag has one."""
-    known = [i for i, name in enumerate(names) if kind.fullmatch(name.strip())]
+    known = [i for i, name in enumerate(names) if kind(name)]
     return np.isin(mode, known) if known else None

@@ -1,4 +1,4 @@
-"""What the report of an own plant says of its identified model: verdicts, figures by variable and by answer."""
+"""The part of an own plant's report on its identified model: verdicts, figures by variable and by answer."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ TRIED = ("Start", "States", "Delays", "Hidden units", "Held-out error", "Spread"
 
 
 def model_section(evidence: Evidence) -> ModelSection | None:
-    """What was found of the model that laws are designed on; None for a case without an identified one."""
+    """The figures of the model that laws are designed on; None for a case without an identified one."""
     part = identified_part(evidence.models)
     if not part:
         return None

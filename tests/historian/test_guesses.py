@@ -123,3 +123,23 @@ def test_a_column_that_copies_an_mv_is_fitted(seed: int) -> None:
     model = fitted(u, [u], np.zeros(len(u), dtype=np.int64))
     assert model is not None
     assert lead(model, u, [u], 0)[0] > 1e3
+
+
+@pytest.mark.parametrize(
+    ("parts", "expected"),
+    [
+        (("PV", "OP", "SP", "MODE"), ["pv", "mv", "sp", "mode"]),
+        (("PV", "CV", "SP", "MODE"), ["pv", "mv", "sp", "mode"]),  # the output is the control variable
+        (("CV", "OUT", "SP", "MD"), ["pv", "mv", "sp", "mode"]),
+        (("PV", "MV", "SV", "MODE"), ["pv", "mv", "sp", "mode"]),
+        (("PV", "LMN", "SP", "MODE"), ["pv", "mv", "sp", "mode"]),
+        (("Istwert", "Stellgröße", "Soll", "Betriebsart"), ["pv", "mv", "sp", "mode"]),
+        (("PV.CV", "OUT.CV", "SP.CV", "MODE.ACTUAL"), ["pv", "mv", "sp", "mode"]),
+    ],
+)
+def test_parts_of_a_loop_by_the_names_that_systems_give_them(
+    parts: Sequence[str], expected: list[str], tmp_path: Path
+) -> None:
+    heads = [f"LIC-1.{part}" for part in parts]
+    found = roles(tmp_path / "export.csv", dict(zip(heads, ("level", "valve", "sp", "mode"), strict=True)))
+    assert list(found.values()) == expected

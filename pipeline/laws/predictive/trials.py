@@ -47,7 +47,7 @@ AT_OUTPUT = (3, 4, 5)  # loops whose loads act on the outputs; those of the othe
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Of C laws: errors of the loops [% of four standard deviations], and the MVs' travel [% of range a sample]."""
+    """The errors of the loops of C laws [% of four standard deviations], and the MVs' travel [% of range a sample]."""
 
     set_points: Array  # (C, LOOPS)
     loads: Array  # (C, LOOPS)
@@ -167,7 +167,7 @@ class Trials:
         return torch.from_numpy(shift_rows(StateEquation(*(t.numpy() for t in (m.a, m.b, m.c, m.w1, m.b1, m.w2)))))
 
     def _samples(self, laws: ControlLaw, x: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Of loops from the states x (count, 2 LOOPS, n_x), sample by sample: outputs, the MV before, and the MV."""
+        """Outputs, the MV before and the MV, sample by sample, of loops from the states x (count, 2 LOOPS, n_x)."""
         model, (n, loops, _), count = self.model, self.sp.shape, len(x)
         middle, n_y = torch.tensor([s.middle for s in self.signals.mv]).double(), model.n_y
         mv = self.mv0.expand(count, -1, -1)

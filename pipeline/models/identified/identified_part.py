@@ -214,7 +214,7 @@ def _proof(
 
 
 def _likely(problem: Problem, selection: Selection, inputs: Sequence[Signal]) -> dict[str, Any]:
-    """Of each MV the periods of dead time of the model, and the least and the most that explain the record alike.
+    """The dead time of each MV [periods] in the model, and the least and the most that explain the record alike.
 
     Those are left out of which a dead time is known, or that they move nothing.
     """
@@ -231,7 +231,7 @@ def _dead_sd(selection: Selection, n_mv: int) -> float:
 
 
 def _unseen(mvs: Sequence[Signal], rows: ScaledRecord, scales: Scales) -> list[str]:
-    """What MVs of a few values leave unseen, a clause each."""
+    """Clauses on what MVs of a few values leave unseen."""
     values = (rows.v * scales.v_scale + scales.v_center).T
     levels = [levels_of(of) for of in values[: len(mvs)]]
     return [only_between(s.name, found, s.unit) for s, found in zip(mvs, levels, strict=True) if found]

@@ -20,12 +20,12 @@ from pipeline.models.identified.trial import Trial
 from pipeline.tuning.responses import reached
 
 ITERATIONS = 20
-"""Of a linear fit."""
+"""Iterations of a linear fit."""
 
 NATS = 5.0
 """Log-likelihood of the held-out rows within which two linear models are alike."""
 
-BENT = 10.0
+NETWORK_NATS = 10.0
 """Log-likelihood by which a network must be better than the best linear model.
 
 It is the best of six: 5 to 8 were seen by chance, of networks that left gain and speed five times as open.
@@ -50,7 +50,7 @@ HALF = 0.5
 UNEVEN = 3.0
 """Nats that count as one of the weight of a dead time: fits of neighbouring ones end as far apart by chance."""
 
-FAR = 10.0
+SCAN_NATS = 10.0
 """Nats by which a dead time is worse, from which on no farther one is tried."""
 
 KEPT = 8
@@ -63,16 +63,16 @@ UNITS_OF, SEEDS, RIDGE = 3, 3, 1.0
 """Linear candidates that carry networks, seeds of each, and the weight of the ridge."""
 
 FITTED: tuple[Literal["gain", "all"], ...] = ("gain", "all")
-"""What a fit changes: the gain of the filter alone, or the model too."""
+"""The parts that a fit changes: the gain of the filter alone, or the model too."""
 
 TRAINED = 60
 """Iterations of a network's fit."""
 
 
-def nats(problem: Problem, worse: Trial, better: Trial) -> float:
-    """Log-likelihood of the held-out rows by which one trial is better than another, n_y n log(e/e')."""
-    rows = sum(problem.folds[k].held.stop - problem.folds[k].held.start for k in worse.folds)
-    return float(problem.data.y.shape[1] * rows * np.log(worse.error / better.error))
+def nats(problem: Problem, trial: Trial, better: Trial) -> float:
+    """Log-likelihood of the held-out rows by which a trial is worse than a better one, n_y n log(e/e')."""
+    rows = sum(problem.folds[k].held.stop - problem.folds[k].held.start for k in trial.folds)
+    return float(problem.data.y.shape[1] * rows * np.log(trial.error / better.error))
 
 
 def worse(problem: Problem, trial: Trial, best: Trial) -> float:
@@ -109,7 +109,7 @@ def _finite(trial: Trial) -> bool:
 
 
 def likely_dead_times(problem: Problem, linear: Sequence[Trial]) -> list[tuple[int, int]]:
-    """Of each input the least and the most periods of dead time of models that are as likely as the best one."""
+    """Least and most periods of dead time of each input, over the models that are as likely as the best one."""
     least = min(t.against for t in linear)
     own = [t for t in linear if t.against == least and t.structure.noise == "all" and _finite(t)]
     own = own or list(linear[:1])
@@ -161,7 +161,7 @@ class NoiseSearch:
         ranked = self.ranked(whole)
         best = ranked[0]
         of_middle = [t for t in ranked if t.structure.delays == middle and t.against == best.against]
-        lead = next((t for t in of_middle if nats(self.rounds.problem, t, best) <= FAR), best)
+        lead = next((t for t in of_middle if nats(self.rounds.problem, t, best) <= SCAN_NATS), best)
         return [lead, *(t for t in ranked if t is not lead)]
 
     def _scanned(self, orders: Sequence[int]) -> tuple[list[Trial], tuple[int, ...]]:
@@ -211,11 +211,11 @@ class NoiseSearch:
             trials = self.ranked([*trials, *self._fitted(nearest, orders)])
             tried |= line
             costs = self._by_dead_time(trials)
-            near = {d for d, (cost, _) in costs.items() if cost <= FAR}
+            near = {d for d, (cost, _) in costs.items() if cost <= SCAN_NATS}
             sides = [side for side in sides if near & of_side[side]]
             if not sides:
                 break
-        costs = {d: found for d, found in self._by_dead_time(trials).items() if d in line}
+        costs = {d: found for d, found in costs.items() if d in line}
         ordered = sorted(costs, key=rows)
         if len(ordered) < 2:
             return trials, (ordered or [at])[0]
@@ -227,7 +227,7 @@ class NoiseSearch:
         return trials, ordered[int(np.searchsorted(weights, 0.5 * weights[-1]))]
 
     def _by_dead_time(self, trials: Sequence[Trial]) -> dict[tuple[int, ...], tuple[float, Trial]]:
-        """Of each dead time its best trial, and the nats by which it is behind the best of all.
+        """Dead times -> (nats behind the best of all, the best trial with them).
 
         Those count alone that contradict what is known the least.
         """

@@ -12,7 +12,7 @@ from pipeline.models.identified.curvature import curved
 from pipeline.models.identified.drift import Drift, drift_of
 from pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from pipeline.models.identified.network_search import NetworkSearch
-from pipeline.models.identified.noise_search import BENT, NATS, NoiseSearch, likely_dead_times, nats
+from pipeline.models.identified.noise_search import NATS, NETWORK_NATS, NoiseSearch, likely_dead_times, nats
 from pipeline.models.identified.rests import INTEGRATES
 from pipeline.models.identified.rounds import Rounds
 from pipeline.models.identified.row_convention import may_act_in_its_row
@@ -53,9 +53,7 @@ class Selection:
     drifts: bool  # whether gain or level move inside the record
     innovations: float | None = None  # nats by which one-step errors prefer the network; None: free runs judged
     farthest: float = FARTHEST  # scaled: where rests of a network may lie
-    dead_times: Sequence[
-        tuple[int, int]
-    ] = ()  # [periods] of each input, least and most of those alike; see NoiseSearch
+    dead_times: Sequence[tuple[int, int]] = ()  # [periods] least and most of each input that explain the rows alike
 
     @property
     def nonlinear(self) -> bool:
@@ -69,7 +67,7 @@ class Selection:
         if self.network.against != self.linear.against:  # what is known of the plant decides before any error
             return self.network.against < self.linear.against
         if self.innovations is not None:
-            return self.innovations > BENT
+            return self.innovations > NETWORK_NATS
         uncertain = 0.0 if self.drifts else self.network.spread / np.sqrt(self.network.seeds)
         return bool(self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error)
 
