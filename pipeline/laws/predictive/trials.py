@@ -64,9 +64,9 @@ class Trials:
     step, which leaves a stable model stable: x+ = F(x) + (p - 1) (F(F(x)) - F(x)) + [load; 0]. States that only
     remember keep their pace. The loads are biases of the MVs and loads at the outputs, in steps and in random walks;
     the noise is the model's estimate. Every set point is a rest of the loop's own plant, so that all are within reach.
-    An output that never comes to rest, as a level, has set points within its record's range. Errors of gain and pace are
-    what the record leaves open (``likely_error``), and no less than ``GAIN`` and ``PACE``; plants are late by ``DEAD``,
-    and one, which is the model in all else, by what the record leaves open where that is more.
+    An output that never comes to rest, as a level, has set points within its record's range. Errors of gain and pace
+    are what the record leaves open (``likely_error``), and no less than ``GAIN`` and ``PACE``; plants are late by
+    ``DEAD``, and one, which is the model in all else, by what the record leaves open where that is more.
     """
 
     model: Identified
