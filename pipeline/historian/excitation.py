@@ -142,7 +142,7 @@ def _input(
     known: Mapping[str, Spectrum],
     certain_of: Mapping[str, Collection[int]],
 ) -> InputReport:
-    """The report on input ``i`` with the values u (n,) and on what answers; ``certain_of`` by PV some settling times."""
+    """Report on input ``i`` with the values u (n,) and on what answers; ``certain_of``: PV -> some settling times."""
     moves = moves_of(u, record.run)
     span = float(np.ptp(u)) if len(u) else 0.0
     still = np.abs(np.diff(u)) <= 1e-9 * span if span > 0 else np.ones(max(len(u) - 1, 1))
