@@ -48,8 +48,9 @@ def confirmed(signals: Sequence[Signal], tags: Sequence[Tag], operated: Collecti
         limits = {} if tag is None else tag.commands
         if tag is not None and not {"command_low", "command_high"} & set(limits) and s.name in operated:
             lines.append(
-                f"{s.name}: the controller may command all of {s.low:g} to {s.high:g} {s.unit}; where the old "
-                f"controller's output is limited, say so: --command {shlex.quote(f'{tag.tag}=LOW..HIGH')}"
+                f"{s.name}: the controller may command all of {s.low:g} to {s.high:g} {s.unit}, from end to end "
+                f"in one period; where the old controller's output is limited, or no valve may slam, say so: --command "
+                f"{shlex.quote(f'{tag.tag}=LOW..HIGH')}, --max-move {shlex.quote(f'{tag.tag}=CHANGE')} in a minute"
             )
         if limits:
             low, high = commanded_range(s, tags)

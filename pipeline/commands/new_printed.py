@@ -80,6 +80,8 @@ def sayings(verdict: Verdict, units: Mapping[str, str], known: Collection[Known]
             # The report has the gain at the middle of the record, by the models that are fitted later.
             by_one = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
             words = [by_one if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
+            hidden = f"or settles slowly: {i.name} follows {pv}, which hides the difference"
+            words += [hidden] if rate is not None and not gain and pv in i.against else []
             seldom = ", as it seldom rests" * (i.held_share < HELD)
             words += [f"first answer not seen{seldom}" if first is None else _after(first, i.first_possible_s[pv])]
             words += [_settles(i, pv)] if gain else []

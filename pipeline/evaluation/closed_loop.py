@@ -26,7 +26,7 @@ STEP_BAND = 0.02  # settled: within this fraction of the step ...
 RANGE_BAND = 0.002  # ... or of the CV's range, whichever is wider (a disturbance test has no step)
 FAR = 0.02  # of the CV's range: a larger error means that the loop has not reached its set point
 SWING, CROSSINGS = 0.01, 3  # of ``span``, the CV's range or its set points', changes of side: it swings to the end
-LEFT = 0.25  # of the CV's range: farther beyond its ends no overshoot leads
+LEFT = 0.25  # of the CV's range: farther beyond its ends a loop has left it
 
 
 def holds(n: int, hold: int) -> list[slice]:
@@ -139,14 +139,17 @@ def locked_up(
     return bool(lock_ups(sp, pv, mv, hold, low=low, high=high, span=span))
 
 
-def left_limits(pv: ArrayLike, *, low: ArrayLike, high: ArrayLike) -> bool:
-    """Whether a CV goes beyond its range [low, high] (n_cv,) by more than ``LEFT`` of it. pv (n, n_cv), without noise.
+def left_limits(pv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike) -> bool:
+    """Whether a CV is beyond its range [low, high] (n_cv,) by more than ``LEFT`` of it in the second half of a hold.
 
-    A loop that swings or drifts so far need not be saturated, so that no lock-up tells of it.
+    A loop that swings or drifts so far need not be saturated, so that no lock-up tells of it. In the first half a loop
+    may overshoot there: on a linear model of twice the gain a step of the set point leads beyond a transmitter's end,
+    and back. pv (n, n_cv), without noise. One that is not finite has left.
     """
     y, bottom, top = (np.asarray(values, dtype=np.float64) for values in (pv, low, high))
     room = LEFT * (top - bottom)
-    return bool(np.any((y < bottom - room) | (y > top + room)))
+    beyond = ~((y >= bottom - room) & (y <= top + room)).reshape(len(y), -1).all(axis=1)
+    return any(bool(beyond[(part.start + part.stop) // 2 : part.stop].any()) for part in holds(len(y), hold))
 
 
 def last_half(*courses: Array) -> slice:

@@ -134,7 +134,7 @@ def seized(case: Case, test: Scenario, loop: Trajectory) -> tuple[bool, int]:
         before = np.vstack([test.mv0, loop.mv])  # the MVs at the beginning of each sample
         beyond = [of for of in jammed if not reached(plant, test, of, loop.x[of.start], before[of.start]).near]
     ends = {end: [getattr(s, end) for s in case.plant.sp_signals] for end in ("low", "high")}
-    left = case.on_models and left_limits(loop.pv[:, :n], **ends)
+    left = case.on_models and left_limits(loop.pv[:, :n], test.hold, **ends)
     return len(jammed) > len(beyond) or left or bool(loop.info[:, -1].any()), len(beyond)
 
 

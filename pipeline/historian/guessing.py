@@ -21,7 +21,7 @@ from pipeline.historian.linear import fitted
 from pipeline.historian.missing_codes import sentinels
 from pipeline.historian.reason import Reason
 from pipeline.historian.sampling import proposed_period
-from pipeline.historian.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag
+from pipeline.historian.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag, automatic, by_hand
 from pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (
@@ -236,6 +236,8 @@ def _guess(series: Series, unit: str) -> Guess:
     texts, counts = sum(series.texts.values()), series.counts()
     if texts > 0.5 * len(series):
         words = (", ".join(t for t, _ in series.texts.most_common(4)),)
+        if not role and _are_modes(series.texts):
+            role = "mode"
         if role == "mode":
             good = 1.0 - counts.get("empty", 0) / len(series)
         return Guess(Tag(tag, "mode" if role == "mode" else "", unit), 0.0, good, Look.TEXTS, words)
@@ -257,6 +259,12 @@ def _guess(series: Series, unit: str) -> Guess:
     low, high = _range(plain, unit, role)
     kept = good - float(codes.mean())
     return Guess(Tag(tag, role, unit, low, high), smallest_difference(plain), kept, look, tuple(notes))
+
+
+def _are_modes(texts: Counter[str]) -> bool:
+    """Whether the texts of a column say who moves an MV: a controller in some rows, a person in others, and no more."""
+    kinds = [(automatic(t), by_hand(t)) for t in texts]
+    return any(a for a, _ in kinds) and any(h for _, h in kinds) and all(a or h for a, h in kinds)
 
 
 def _counts(tag: str, plain: Array) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -11,13 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.historian.grid import Grid
 from pipeline.historian.guessing import loop_in
-from pipeline.historian.tags import Tag
+from pipeline.historian.tags import Tag, automatic, by_hand
 from pipeline.metrics import Array
 from pipeline.records.set_points import SetPoints
-
-AUTOMATIC = re.compile(r"a|aut.*|[abcr]?cas.*|kas.*|closed", re.IGNORECASE)  # words of modes: a controller moves the MV
-MANUAL = re.compile(r"m|i?man.*|h|hand.*|open", re.IGNORECASE)  # a person does, whatever else the mode's name says
-WORDS = re.compile(r"[\W\d_]+")  # between the words of a mode's name, as in 2-AUTO and Local.Man
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,16 +74,6 @@ def _partner(sp: Tag, tags: Sequence[Tag], place: int) -> Tag | None:
         if own and loop_in(tag) == own:
             return tag
     return tags[place] if 0 <= place < len(tags) else None
-
-
-def by_hand(mode: str) -> bool:
-    """Whether the name of a mode says that a person moves the MV."""
-    return any(MANUAL.fullmatch(word) for word in WORDS.split(mode))
-
-
-def automatic(mode: str) -> bool:
-    """Whether the name of a mode says that a controller moves the MV."""
-    return not by_hand(mode) and any(AUTOMATIC.fullmatch(word) for word in WORDS.split(mode))
 
 
 def _rows_of(kind: Callable[[str], bool], mode: Array, names: Sequence[str]) -> NDArray[np.bool_] | None:

@@ -31,6 +31,9 @@ READ_ONLY = ("step", "good_percent", "remark")
 COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, *WORDS, "loop", "known", *READ_ONLY)
 NO_LOOP = "-"  # in column loop, of a tag whose name says another
 OPTION = re.compile(r"^(?P<tag>.+?)(\[(?P<unit>[^\[\]]*)\])?(=(?P<low>[^.=]*(\.\d+)?)\.\.(?P<high>.+))?$")
+AUTOMATIC = re.compile(r"a|aut.*|[abcr]?cas.*|kas.*|closed", re.IGNORECASE)  # words of modes: a controller moves the MV
+MANUAL = re.compile(r"m|i?man.*|h|hand.*|open", re.IGNORECASE)  # a person does, whatever else the mode's name says
+BETWEEN_WORDS = re.compile(r"[\W\d_]+")  # of a mode's name, as in 2-AUTO and Local.Man
 UNSAFE = re.compile(r"[^A-Za-z0-9_.\-/:#]+")
 RANGES = """low, high: the range in which a reading can be true; of an mv it holds all that the valve did
 command_low, command_high of an mv: the range that the controller may command; empty is low, high
@@ -122,6 +125,16 @@ class Guess:
     def as_role(self, role: str, note: str = "") -> Guess:
         """The guess with another role, and a note on why."""
         return replace(self, tag=replace(self.tag, role=role), notes=(*self.notes, *filter(None, [note])))
+
+
+def by_hand(mode: str) -> bool:
+    """Whether the name of a mode says that a person moves the MV."""
+    return any(MANUAL.fullmatch(word) for word in BETWEEN_WORDS.split(mode))
+
+
+def automatic(mode: str) -> bool:
+    """Whether the name of a mode says that a controller moves the MV."""
+    return not by_hand(mode) and any(AUTOMATIC.fullmatch(word) for word in BETWEEN_WORDS.split(mode))
 
 
 def safe_name(tag: str) -> str:

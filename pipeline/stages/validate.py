@@ -43,6 +43,11 @@ from pipeline.stages.paths import (
 from serving.controller import Controller
 
 NOTHING = "so nothing is shipped"
+REMEDY = "give the law other numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
+OWN_REMEDY = (
+    "say with --known what you know of gains and dead times (the report says what the record leaves open of them), or "
+    "run the step test that `loopwright new` lists and give its rows too"
+)
 RIVAL = "it is the loop that the plant was run by before, and stands here to be compared with"
 FIELDS = ("time_s", "sp", "pv", "mv", "info")  # of the trajectories that are kept
 
@@ -85,9 +90,8 @@ def validate(name: str) -> None:
     source = controller_file(params.case, params.name, BASE, shipped.seed)
     locked_up = _of_tests(base, "locked_up")
     how = "locked up or left its limits" if case.on_models else "locked up"
-    withheld = f"controllers.{name} {how} on {lock_up_text(locked_up)}, {NOTHING}; give the law other numbers or models"
-    if params.case not in sections("plants"):  # who runs an own plant must not ship such a law
-        withheld += ", or mark the reproduction of a paper's law with `as_printed: true`"
+    own = params.case in sections("plants")  # who runs one must not ship such a law, and gives no law other numbers
+    withheld = f"controllers.{name} {how} on {lock_up_text(locked_up)}, {NOTHING}; {OWN_REMEDY if own else REMEDY}"
     refused = bool(locked_up) and not params.as_printed
     if refused and not case.on_models:
         raise LawError(withheld)

@@ -77,11 +77,22 @@ def test_the_swinging_loop_is_no_lock_up(level: OwnCase) -> None:
 
 def test_the_range_may_be_overshot_a_little() -> None:
     def left(*pv: float) -> bool:
-        return left_limits(np.array([[v, 5.0] for v in pv]), low=[0.0, 0.0], high=[2.0, 10.0])
+        return left_limits(np.array([[v, 5.0] for v in pv]), 0, low=[0.0, 0.0], high=[2.0, 10.0])
 
     assert not left(0.0, 2.0, 2.0 + 2 * LEFT)
     assert left(0.0, 2.01 + 2 * LEFT)
     assert left(1.0, -0.01 - 2 * LEFT)
+    assert left(1.0, float("nan"))
+
+
+def test_a_loop_may_overshoot_its_range_early_in_a_hold_and_must_come_back() -> None:
+    """A plant of twice the gain overshoots by half a step; a loop that swings or drifts is there in the second half."""
+    pv = np.full(40, 1.0)
+    pv[22:28] = 3.0
+    assert not left_limits(pv, 20, low=[0.0], high=[2.0])
+    pv[22:31] = 3.0
+    assert left_limits(pv, 20, low=[0.0], high=[2.0])
+    assert left_limits(np.where(np.arange(40) % 4 < 2, 3.0, -1.0), 20, low=[0.0], high=[2.0])
 
 
 def test_plants_in_equations_are_judged_by_lock_ups_alone() -> None:

@@ -135,6 +135,7 @@ def test_a_column_that_copies_an_mv_is_fitted(seed: int) -> None:
         (("PV", "LMN", "SP", "MODE"), ["pv", "mv", "sp", "mode"]),
         (("Istwert", "Stellgröße", "Soll", "Betriebsart"), ["pv", "mv", "sp", "mode"]),
         (("PV.CV", "OUT.CV", "SP.CV", "MODE.ACTUAL"), ["pv", "mv", "sp", "mode"]),
+        (("PV", "OP", "SP", "BA"), ["pv", "mv", "sp", "mode"]),  # its texts are modes
     ],
 )
 def test_parts_of_a_loop_by_the_names_that_systems_give_them(

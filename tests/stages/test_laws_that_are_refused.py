@@ -100,7 +100,7 @@ def test_a_pid_that_locks_up_need_not_be_beaten_and_the_report_says_so() -> None
     controllers_of_a_lag({"pid": GIVEN | {"kc": -2.0}, "other": GIVEN})
     found = designed_and_validated("pid", "other")
     assert re.search(
-        r"it: pid is not shipped, because it locked up or left its limits on .*; give the law other numbers .*\.\n",
+        r"it: pid is not shipped, because it locked up or left its limits on .*; say with --known .*\.\n",
         pages()[1],
     )
     assert "as_printed" not in "".join(pages())  # an own plant reproduces no paper

@@ -135,7 +135,7 @@ class Stress:
             draw.index,
             dict.fromkeys(figures, float("inf")) if broke else figures,
             locked_up(loop.sp, loop.pv[:, :n_cv], loop.mv[:, :n_cv], test.hold, **limits, span=spans),
-            left_limits(loop.pv[:, :n_cv], **ends),
+            left_limits(loop.pv[:, :n_cv], test.hold, **ends),
             int(loop.info.sum()),
             broke,
             bool(np.any(swings(loop.sp, loop.pv[:, :n_cv], np.array(spans)))),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.historian.loop_rows import automatic, by_hand
+from pipeline.historian.tags import automatic, by_hand
 
 
 @pytest.mark.parametrize(
