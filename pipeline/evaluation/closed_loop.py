@@ -148,8 +148,9 @@ def left_limits(pv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike) ->
     """
     y, bottom, top = (np.asarray(values, dtype=np.float64) for values in (pv, low, high))
     room = LEFT * (top - bottom)
-    beyond = ~((y >= bottom - room) & (y <= top + room)).reshape(len(y), -1).all(axis=1)
-    return any(bool(beyond[(part.start + part.stop) // 2 : part.stop].any()) for part in holds(len(y), hold))
+    inside = (y >= bottom - room) & (y <= top + room)
+    late = (slice((part.start + part.stop) // 2, part.stop) for part in holds(len(y), hold))
+    return not all(np.all(np.asarray(inside)[part]) for part in late)
 
 
 def last_half(*courses: Array) -> slice:

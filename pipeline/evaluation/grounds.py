@@ -69,12 +69,18 @@ class Grounds:
     unproven: tuple[str, ...] = ()
     record: RecordVerdict | None = None
     farthest: Mapping[str, str] = field(default_factory=dict)
+    proven: bool = False  # rows that no fit saw prove the models, whatever its screening said
     ahead: int | None = None  # samples that the fit was predicted ahead at most, of a record in closed loop; None: all
 
     @property
     def doubt(self) -> str:
-        """Why a model of the record is doubtful, by its screening; empty where it is not, or nobody screened it."""
-        return "" if self.record is None else self.record.doubt
+        """Why a model of the record is doubtful, by its screening; empty where it is not, or nobody screened it.
+
+        Where the models are proven later it stands as what it was: a doubt before there was a model.
+        """
+        if self.record is None or not self.record.doubt or not self.proven:
+            return "" if self.record is None else self.record.doubt
+        return f"the screening doubted these data ({'; '.join(self.record.reasons)}), and the models are proven since"
 
     @property
     def operated(self) -> tuple[str, ...]:
@@ -117,7 +123,8 @@ class Grounds:
     def to_dict(self) -> dict[str, Any]:
         """For the manifest: the figures, and the sentence."""
         figures = asdict(self)
-        unproven, record, _, ahead = (figures.pop(name) for name in ("unproven", "record", "farthest", "ahead"))
+        left_out = ("unproven", "record", "farthest", "ahead", "proven")
+        unproven, record, _, ahead, _ = (figures.pop(name) for name in left_out)
         further = {"unproven": list(unproven)} if unproven else {}
         further |= {} if ahead is None else {"ahead": ahead}
         further |= {"data": record["carries"], "data_reasons": list(record["reasons"])} if record else {}

@@ -43,6 +43,7 @@ def grounds_of(case: Case, models: Mapping[str, Any], reached: Mapping[str, Rang
     names = [s.name for s in case.plant.sp_signals]
     wanted = dict(zip(names, zip(asked.min(axis=0).tolist(), asked.max(axis=0).tolist(), strict=True), strict=True))
     unproven = (sign_doubts({"": models}), fit_doubts({"": models})) if case.stand_in == IDENTIFIED else ()
+    identified = identified_part({"": models})
     left = {law: beyond(ranges, case.recorded) for law, ranges in reached.items()}
     loops = beyond(widest(reached.values()), case.recorded)
     return Grounds(
@@ -52,7 +53,8 @@ def grounds_of(case: Case, models: Mapping[str, Any], reached: Mapping[str, Rang
         tuple(why for why in unproven if why),
         case.record_verdict,
         {name: max(left, key=lambda law: left[law].get(name, 0.0)) for name in loops if "" not in left},
-        (identified_part({"": models}).get("structure") or {}).get("rows_ahead"),
+        bool((identified.get("proof") or {}).get("answers")) and not any(unproven),
+        (identified.get("structure") or {}).get("rows_ahead"),
     )
 
 

@@ -150,6 +150,7 @@ def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, 
 
 def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
     plant, gains = evidence.case.plant_class, part.get("gains") or {}
+    proof = (part.get("proof") or {}).get("answers") or {}
     bent = (part.get("structure") or {}).get("hidden", 1) > 0
     rows = []
     for signal in plant.sp_signals:
@@ -170,12 +171,19 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
                         f"{number(found['gain'])} ± {number(found['spread'], 2)}",
                         gain_unit(signal, given, bool(found.get("rate"))),
                     ),
-                    SIGNS.get(found["sign"], found["sign"]),
+                    _sign(found, ((proof.get(signal.name) or {}).get(given.name) or {})),
                     over if bent else "one gain: the model is linear",
                     "–" if not first else number(first * plant.period_s),
                 )
             )
     return tuple(rows)
+
+
+def _sign(gain: Mapping[str, Any], answer: Mapping[str, Any]) -> str:
+    """The sign of a gain; of one that is open, where a control acts on an answer whose sign is proven, that one's."""
+    if gain["sign"] == "uncertain" and answer.get("verdict") == "proven":
+        return f"{SIGNS['+' if answer['model'] > 0 else '-']}, its end is open"
+    return SIGNS.get(gain["sign"], gain["sign"])
 
 
 def answers_after(curve: Mapping[str, Any], dead: float = 0.0) -> float:

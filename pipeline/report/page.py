@@ -131,7 +131,7 @@ def _caveat(evidence: Evidence, judged: Judged) -> str:
     """What a person who reads of the best controller must know beside it, as sentences; empty if nothing."""
     missed = [row.what for row in judged.acceptance if row.holds is False]
     found = [f"Not met: {'; '.join(missed)}."] if missed else []
-    if evidence.grounds is not None and evidence.grounds.doubt:
+    if evidence.grounds is not None and evidence.grounds.doubt and not evidence.grounds.proven:
         found.append("A model of these data is doubtful, as said below.")
     return " ".join(found)
 

@@ -56,6 +56,9 @@ def test_what_the_screening_said_of_the_record_is_said_wherever_its_figures_are(
     assert grounds.warning == f"A{grounds.doubt[1:]}."
     assert grounds.to_dict()["data"] == "doubtful"
     assert "1.5 degC over 9 rows in automatic" in grounds.operated[0]
+    proven = Grounds({"T": 90.0}, {}, {}, record=found, proven=True)
+    assert proven.doubt.startswith("the screening doubted these data (V hardly moves; few rows)")
+    assert proven.to_dict()["data"] == "doubtful"
     good = Grounds({"T": 90.0}, {}, {}, record=RecordVerdict("yes"))
     assert (good.doubt, good.warning) == ("", "")
 
