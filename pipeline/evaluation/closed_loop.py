@@ -142,6 +142,8 @@ def locked_up(
 def left_limits(pv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike) -> bool:
     """Whether a CV is beyond its range [low, high] (n_cv,) by more than ``LEFT`` of it in the second half of a hold.
 
+    Without holds, as under loads and where a record is replayed, at any time.
+
     A loop that swings or drifts so far need not be saturated, so that no lock-up tells of it. In the first half a loop
     may overshoot there: on a linear model of twice the gain a step of the set point leads beyond a transmitter's end,
     and back. pv (n, n_cv), without noise. One that is not finite has left.
@@ -149,7 +151,7 @@ def left_limits(pv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike) ->
     y, bottom, top = (np.asarray(values, dtype=np.float64) for values in (pv, low, high))
     room = LEFT * (top - bottom)
     inside = (y >= bottom - room) & (y <= top + room)
-    late = (slice((part.start + part.stop) // 2, part.stop) for part in holds(len(y), hold))
+    late = (slice((part.start + part.stop) // 2 if hold else 0, part.stop) for part in holds(len(y), hold))
     return not all(np.all(np.asarray(inside)[part]) for part in late)
 
 

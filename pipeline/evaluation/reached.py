@@ -53,7 +53,7 @@ def grounds_of(case: Case, models: Mapping[str, Any], reached: Mapping[str, Rang
         tuple(why for why in unproven if why),
         case.record_verdict,
         {name: max(left, key=lambda law: left[law].get(name, 0.0)) for name in loops if "" not in left},
-        bool((identified.get("proof") or {}).get("answers")) and not any(unproven),
+        case.stand_in == IDENTIFIED and bool((identified.get("proof") or {}).get("answers")) and not any(unproven),
         (identified.get("structure") or {}).get("rows_ahead"),
     )
 

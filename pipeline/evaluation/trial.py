@@ -43,7 +43,7 @@ class Trial:
     swings: dict[str, int]  # the same of closed loops that swing to the end
     beyond_reach: dict[str, int]  # test -> holds that count as no lock-up, because no control gets to the set point
     curves: dict[str, Trajectory]
-    reached: dict[str, tuple[float, float]]  # by closed loops without noise, PVs and MVs; of a case on models alone
+    reached: dict[str, tuple[float, float]]  # without noise, models gone wrong apart, PVs and MVs; of a case on models
     cycles: dict[str, Cycle]  # test -> its worst limit cycle, without noise; of a case on models alone
     cycling: Trajectory | None  # the loop with the worst of them
 

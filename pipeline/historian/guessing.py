@@ -26,11 +26,17 @@ from pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (
     (r"(mode|modus|betriebsart|md|auto)$", "mode"),
-    (r"(^|[ ._:/-])(sp|spt|sv|set[ _-]?(point|value|pt)|target|soll(wert)?|consigne|consigna|w)([ ._:/-]|$)", "sp"),
-    (r"(^|[ ._:/-])(op|out(put)?|mv|co|lmn|valve|stell(wert|gr(ö|oe)(ß|ss)e)|y)([ ._:/-]|$)", "mv"),
-    (r"(^|[ ._:/-])(pv|cv|me|meas|ist(wert)?|x)([ ._:/-]|$)", "pv"),
+    (r"(^|[ ._:/-])(sp|spt|setpoint|set point|sollwert|w)([ ._:/-]|$)", "sp"),
+    (r"(^|[ ._:/-])(op|out|mv|co|valve|stellwert|y)([ ._:/-]|$)", "mv"),
+    (r"(^|[ ._:/-])(pv|cv|me|meas|istwert|x)([ ._:/-]|$)", "pv"),
+    # Words that mean something else elsewhere: an SV in front is a solenoid valve.
+    (r"[ ._:/-](sv|set[ _-]?(value|pt)|target|soll|consigne|consigna)$", "sp"),
+    (r"[ ._:/-](output|lmn|stellgr(ö|oe)(ß|ss)e)$", "mv"),
+    (r"[ ._:/-]ist$", "pv"),
 )
-ATTRIBUTE = re.compile(r"([ ._:/-](?:mode|sp|op|out|mv|co|pv))[./#](cv|f_cv|value|val|actual)$", re.IGNORECASE)
+ATTRIBUTE = re.compile(
+    r"([ ._:/-](?:mode|sp|sv|op|out|output|lmn|mv|co|pv))[./#](cv|f_cv|value|val|actual)$", re.IGNORECASE
+)
 """The current value of a parameter, as SP.CV and MODE.ACTUAL: the parameter's name says what it is."""
 CONTROL_VARIABLE = re.compile(r"[ ._:/-]cv$", re.IGNORECASE)
 FLOW = re.compile(
@@ -68,7 +74,8 @@ LOOP = re.compile(r"^(?P<loop>.*?)[ ._:/-]+[A-Za-z ]+$")
 def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
     """One guess for every column, in the order of the file."""
     found = [_guess(s, units.get(name, "")) for name, s in export.series.items()]
-    found = _flows_without_loop([_cascaded(_output(g, found), found) for g in found])
+    found = [_mode_of(_output(g, found), found, export.series[g.tag.tag]) for g in found]
+    found = _flows_without_loop([_cascaded(g, found) for g in found])
     if not any(g.tag.role == "mv" for g in found):  # names say nothing: what moves in steps may be one
         moved = [g for g in found if not g.tag.role and g.look is Look.STEPS]
         moved = [g for g in moved if not _is_flow(g)] or moved  # a feed that others set, where a valve is there
@@ -128,13 +135,23 @@ def _flows_without_loop(found: Sequence[Guess]) -> list[Guess]:
 
 
 def _output(guess: Guess, found: Sequence[Guess]) -> Guess:
-    """The guess; an MV where it is the CV of a loop with a PV and no output: some systems call the output so."""
+    """The guess; an MV where it is the CV of a loop with a PV, and no loop has an output: some systems call it so."""
     loop = loop_of(guess.tag.tag)
     if guess.tag.role != "pv" or not loop or not CONTROL_VARIABLE.search(_parameter(guess.tag.tag)):
         return guess
-    others = [g.tag for g in found if g is not guess and loop_of(g.tag.tag) == loop]
-    is_output = any(t.role == "pv" for t in others) and not any(t.role == "mv" for t in others)
-    return guess.as_role("mv", "guessed: the loop has a PV beside it") if is_output else guess
+    beside = any(g is not guess and g.tag.role == "pv" and loop_of(g.tag.tag) == loop for g in found)
+    if not beside or any(g.tag.role == "mv" for g in found):
+        return guess
+    return guess.as_role("mv", "guessed: the loop has a PV beside it")
+
+
+def _mode_of(guess: Guess, found: Sequence[Guess], series: Series) -> Guess:
+    """The guess; the mode of its loop where its texts say who moves the MV, whatever the tag is called."""
+    loop, of = loop_of(guess.tag.tag), guess.tag.tag
+    if guess.tag.role or guess.look is not Look.TEXTS or not loop or LABEL.search(of) or not _are_modes(series.texts):
+        return guess
+    loops = {loop_of(g.tag.tag) for g in found if g.tag.role in {"pv", "mv", "sp"}}
+    return guess.as_role("mode", "guessed: its texts are modes") if loop in loops else guess
 
 
 def _cascaded(guess: Guess, found: Sequence[Guess]) -> Guess:
@@ -236,8 +253,6 @@ def _guess(series: Series, unit: str) -> Guess:
     texts, counts = sum(series.texts.values()), series.counts()
     if texts > 0.5 * len(series):
         words = (", ".join(t for t, _ in series.texts.most_common(4)),)
-        if not role and _are_modes(series.texts):
-            role = "mode"
         if role == "mode":
             good = 1.0 - counts.get("empty", 0) / len(series)
         return Guess(Tag(tag, "mode" if role == "mode" else "", unit), 0.0, good, Look.TEXTS, words)
@@ -262,9 +277,13 @@ def _guess(series: Series, unit: str) -> Guess:
 
 
 def _are_modes(texts: Counter[str]) -> bool:
-    """Whether the texts of a column say who moves an MV: a controller in some rows, a person in others, and no more."""
-    kinds = [(automatic(t), by_hand(t)) for t in texts]
-    return any(a for a, _ in kinds) and any(h for _, h in kinds) and all(a or h for a, h in kinds)
+    """Whether the texts of a column say who moves an MV: a controller in some rows, a person in others, and no more.
+
+    Single letters may be grades.
+    """
+    kinds = [(automatic(t), by_hand(t)) for t in texts if len(t.strip()) > 2]
+    said = all(a or h for a, h in kinds) and len(kinds) == len(texts)
+    return said and any(a for a, _ in kinds) and any(h for _, h in kinds)
 
 
 def _counts(tag: str, plain: Array) -> bool:

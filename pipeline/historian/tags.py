@@ -31,8 +31,9 @@ READ_ONLY = ("step", "good_percent", "remark")
 COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, *WORDS, "loop", "known", *READ_ONLY)
 NO_LOOP = "-"  # in column loop, of a tag whose name says another
 OPTION = re.compile(r"^(?P<tag>.+?)(\[(?P<unit>[^\[\]]*)\])?(=(?P<low>[^.=]*(\.\d+)?)\.\.(?P<high>.+))?$")
-AUTOMATIC = re.compile(r"a|aut.*|[abcr]?cas.*|kas.*|closed", re.IGNORECASE)  # words of modes: a controller moves the MV
-MANUAL = re.compile(r"m|i?man.*|h|hand.*|open", re.IGNORECASE)  # a person does, whatever else the mode's name says
+AUTOMATIC = re.compile(r"a|aut.*|[abcr]?cas.*|kas.*", re.IGNORECASE)  # words of modes: a controller moves the MV
+MANUAL = re.compile(r"m|i?man.*|h|hand.*", re.IGNORECASE)  # a person does, whatever else the mode's name says
+DENIED = re.compile(r"not?|non|off|dis.*", re.IGNORECASE)  # words that take back what another says
 BETWEEN_WORDS = re.compile(r"[\W\d_]+")  # of a mode's name, as in 2-AUTO and Local.Man
 UNSAFE = re.compile(r"[^A-Za-z0-9_.\-/:#]+")
 RANGES = """low, high: the range in which a reading can be true; of an mv it holds all that the valve did
@@ -129,12 +130,18 @@ class Guess:
 
 def by_hand(mode: str) -> bool:
     """Whether the name of a mode says that a person moves the MV."""
-    return any(MANUAL.fullmatch(word) for word in BETWEEN_WORDS.split(mode))
+    return _says(mode, MANUAL)
 
 
 def automatic(mode: str) -> bool:
     """Whether the name of a mode says that a controller moves the MV."""
-    return not by_hand(mode) and any(AUTOMATIC.fullmatch(word) for word in BETWEEN_WORDS.split(mode))
+    return not by_hand(mode) and _says(mode, AUTOMATIC)
+
+
+def _says(mode: str, kind: re.Pattern[str]) -> bool:
+    """Whether a mode's name has a word of a kind, and none that takes it back."""
+    words = BETWEEN_WORDS.split(mode)
+    return any(map(kind.fullmatch, words)) and not any(map(DENIED.fullmatch, words))
 
 
 def safe_name(tag: str) -> str:

@@ -98,7 +98,7 @@ def _in_range(evidence: Evidence, law: str) -> Statement:
         return axis_label(f"{name} {number(low, 4)} … {number(high, 4)}", unit)
 
     return Statement(
-        f"{law}, lowest and highest process variable, tests without noise",
+        f"{law}, lowest and highest process variable, tests without noise, models gone wrong apart",
         "within " + ", ".join(words(s.name, s.unit, s.low, s.high) for s in pvs),
         ", ".join(words(s.name, s.unit, low, high) for s, low, high in known) or UNMEASURED,
         all(s.low <= low and high <= s.high for s, low, high in known) if known else None,

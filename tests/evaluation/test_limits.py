@@ -92,6 +92,9 @@ def test_a_loop_may_overshoot_its_range_early_in_a_hold_and_must_come_back() -> 
     assert not left_limits(pv, 20, low=[0.0], high=[2.0])
     pv[22:31] = 3.0
     assert left_limits(pv, 20, low=[0.0], high=[2.0])
+    pv = np.full(40, 1.0)
+    pv[2:6] = 9.0
+    assert left_limits(pv, 0, low=[0.0], high=[2.0])  # without holds there is no step to overshoot from
     assert left_limits(np.where(np.arange(40) % 4 < 2, 3.0, -1.0), 20, low=[0.0], high=[2.0])
 
 

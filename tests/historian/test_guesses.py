@@ -34,6 +34,7 @@ def tank() -> dict[str, np.ndarray]:
         "whole": np.round(valve),
         "sp": np.repeat(random.uniform(4, 6, N // 100), 100).round(1),
         "mode": np.where(np.arange(N) % 900 < 800, "AUTO", "MAN"),
+        "position": np.where(np.arange(N) % 700 < 600, "Open", "Closed"),
         "two": np.where(valve > 50, 55.0, 45.0),
     }
 
@@ -136,6 +137,7 @@ def test_a_column_that_copies_an_mv_is_fitted(seed: int) -> None:
         (("Istwert", "Stellgröße", "Soll", "Betriebsart"), ["pv", "mv", "sp", "mode"]),
         (("PV.CV", "OUT.CV", "SP.CV", "MODE.ACTUAL"), ["pv", "mv", "sp", "mode"]),
         (("PV", "OP", "SP", "BA"), ["pv", "mv", "sp", "mode"]),  # its texts are modes
+        (("PV.CV", "OUT.CV", "SV.CV", "BA"), ["pv", "mv", "sp", "mode"]),
     ],
 )
 def test_parts_of_a_loop_by_the_names_that_systems_give_them(
@@ -144,3 +146,22 @@ def test_parts_of_a_loop_by_the_names_that_systems_give_them(
     heads = [f"LIC-1.{part}" for part in parts]
     found = roles(tmp_path / "export.csv", dict(zip(heads, ("level", "valve", "sp", "mode"), strict=True)))
     assert list(found.values()) == expected
+
+
+@pytest.mark.parametrize(
+    ("heads", "expected"),
+    [
+        (("LIC-1.PV", "SV-101.OP"), ["pv", "mv"]),  # a solenoid valve
+        (("LIC-1.PV", "LV-1.OP", "LIC-1.SP", "XV-7.STATUS"), ["pv", "mv", "sp", ""]),
+    ],
+)
+def test_words_that_mean_something_else_elsewhere(heads: Sequence[str], expected: list[str], tmp_path: Path) -> None:
+    found = roles(tmp_path / "export.csv", dict(zip(heads, ("level", "valve", "sp", "position"), strict=False)))
+    assert list(found.values()) == expected
+
+
+def test_a_cv_beside_an_output_is_no_output(tmp_path: Path) -> None:
+    heads = ("LIC-1.PV", "LIC-1.CV", "LV-1.OP", "LIC-1.SP")
+    found = roles(tmp_path / "export.csv", dict(zip(heads, ("level", "level", "valve", "sp"), strict=True)))
+    assert found["LV-1.OP"] == "mv"
+    assert found["LIC-1.CV"] != "mv"
