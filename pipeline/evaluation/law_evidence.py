@@ -86,7 +86,7 @@ class LawMetrics:
     reproduction of a paper's law; ``sequences``: test -> seed of a sequence -> medians over the data seeds;
     ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its
     lowest and highest value in closed loops without noise on models of a record, those gone wrong apart; ``replay``:
-    MV -> figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing to the end;
+    MV -> figures of the shipped file over rows of that record; ``swings``: as ``locked_up``, loops that swing;
     ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``cycles``: test -> the
     worst limit cycle of the shipped file; ``poor``: why a law that locked up nowhere is not shipped, a clause after its
     name, and what to do; ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to
