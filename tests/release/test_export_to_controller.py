@@ -89,7 +89,7 @@ def test_the_report_says_models_and_no_paper(folder: Path) -> None:
         assert f"figures/{picture}.png" in html
     validation = json.loads((folder / "artifacts/tank/validation.json").read_text())
     assert validation["on_models"] is True
-    assert set(validation["grounds"]) == {"record", "fit", "set_points", "loops", "farthest"}
+    assert set(validation["grounds"]) == {"record", "fit", "set_points", "loops", "farthest", "proven"}
     assert 1 <= validation["gate"]["laws"]["predictive"]["score"] < validation["gate"]["laws"]["pid"]["score"]
     assert validation["bounds"]["held_out"]["nmpc"]["failures"] == 0
     tests = validation["scenarios"]
