@@ -133,20 +133,21 @@ class OwnCase(OwnEnsemble):
         return dict(self._scenarios)
 
     @property
-    def _pairs(self) -> list[tuple[int, OwnPlant, int]]:
-        """Each held-out seed with its plant, and its place: by turns these take sides and errors."""
-        return [(seed, self.members[i % len(self.members)], i) for i, seed in enumerate(self.held_out_seeds)]
+    def _pairs(self) -> list[tuple[int, OwnPlant]]:
+        """Each held-out seed with its plant, these by turns."""
+        return list(zip(self.held_out_seeds, cycle(self.members), strict=False))
 
     @cached_property
     def _held_out(self) -> tuple[Scenario, ...]:
         title = "Set points, on models identified from the record"
-        return tuple(self._test("held_out", title, self.reach.set_points(p, s), p, s, {}) for s, p, _ in self._pairs)
+        return tuple(self._test("held_out", title, self.reach.set_points(p, s), p, s, {}) for s, p in self._pairs)
 
     @cached_property
     def _scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         members, pairs = self.members, self._pairs
         errors = errors_of(self._nominal)
-        spoilt = [self._spoilt(p, s, errors[i % len(errors)]) for s, p, i in pairs]
+        spoilt = [self._spoilt(p, s, of) for (s, p), of in zip(pairs, cycle(errors), strict=False)]
+        upwards = [(p, up) for (_, p), up in zip(pairs, cycle((True, False)), strict=False)]
         less = sorted({share for _, share in spoilt if share < 1})
         title = f"Set points, on such models gone wrong: {self._doubts}"
         if less:
@@ -157,8 +158,8 @@ class OwnCase(OwnEnsemble):
         return {
             "held_out": self._held_out,
             SPOILT: tuple(replace(test, title=title) for test, _ in spoilt),
-            **self._loads([(p, i % 2 == 0) for _, p, i in pairs]),
-            **self._measured([(p, i % 2 == 0) for _, p, i in pairs]),
+            **self._loads(upwards),
+            **self._measured(upwards),
             **self._daily(members),
         }
 

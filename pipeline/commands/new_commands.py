@@ -1,4 +1,4 @@
-"""What a controller may command, beside what a record or a simulator shows of its MVs."""
+"""The ranges and moves that a controller may command, beside what a record or a simulator shows of its MVs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def commanded(inputs: Sequence[InputReport], tags: Sequence[Tag]) -> list[InputR
 
 
 def confirmed(signals: Sequence[Signal], tags: Sequence[Tag], operated: Collection[str] = ()) -> list[str]:
-    """What the controller may command, a line for each MV of which a person said it.
+    """The ranges and moves that the controller may command, a line for each MV of which a person said it.
 
     And one for each of the ``operated`` MVs of which nobody did: the output of its old controller may have had limits,
     for a reason that no record shows.

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from own_cases import controllers_of_a_lag
+from own_cases import controllers_of_a_lag, two_lags
 from rich.console import Console
 
 from pipeline.evaluation.grounds import Grounds
 from pipeline.evaluation.proof import fit_doubts, sign_doubts, statements
+from pipeline.evaluation.reached import grounds_of
 from pipeline.evaluation.validation import Validation
 from pipeline.report.results import show_results
 from pipeline.stages.design import design
@@ -44,6 +45,19 @@ def test_a_proven_model_meets_both_rows() -> None:
     assert (rows[0].limit, rows[0].measured) == ("≤ 0.5, 50 % of its motion there", "0.1")
     assert rows[1].measured == "2 (1.8 … 2.2); one-step predictions 1.9 ± 0.2"
     assert sign_doubts({"": models()}) == fit_doubts({"": models()}) == ""
+
+
+@pytest.mark.parametrize(
+    ("made", "proven"),
+    [(models(), True), (models(missed=0.9), False), (models(verdict="opposite"), False), ({}, False)],
+)
+def test_grounds_say_whether_models_are_proven(
+    made: dict[str, Any], proven: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = grounds_of(two_lags(), made, {})
+    assert found is not None
+    assert found.proven is proven
 
 
 def test_models_of_which_the_fit_says_nothing_have_no_rows() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -47,6 +48,15 @@ def test_a_level_has_a_rate_and_no_gain(noise: float, tmp_path: Path) -> None:
     assert "integrates: 0.1" in lines(found)
     assert "[m] per [%] and minute" in lines(found)
     assert "gain" not in lines(found)
+
+
+def test_under_a_controller_a_level_may_be_a_plant_that_settles_slowly(tmp_path: Path) -> None:
+    verdict = screen_of(level(), tmp_path, TAGS).report.verdict
+    valve, flow = verdict.inputs
+    held = replace(verdict, inputs=(replace(valve, against=("TIC-101.PV",)), replace(flow, against=())))
+    by_valve, by_flow = sayings(held, {})
+    assert "or settles slowly" in by_valve
+    assert "or settles slowly" not in by_flow
 
 
 def test_a_level_with_its_loads_measured_does_not_wander(tmp_path: Path) -> None:

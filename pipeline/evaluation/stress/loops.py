@@ -47,7 +47,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Stress:
-    """What a worker needs for a batch of loops: how they are drawn, and the bytes of the controller file."""
+    """The needs of a worker for a batch of loops: how they are drawn, and the bytes of the controller file."""
 
     drawing: Drawing
     content: bytes
