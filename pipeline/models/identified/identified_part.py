@@ -151,7 +151,7 @@ class IdentifiedPart(Part):
         unused = unused_answers(controlled, np.median(curves, axis=0) / size[:, None, None], structure, (n_cv, n_mv))
         margin = sign_margin(controlled, unused, LIKELY_SDS) if n_mv > 1 else -np.inf
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
-        dead = np.maximum(doubt.dead, _dead_sd(selection, n_mv))
+        dead = np.array([_later(selection, n_mv)]) if selection.dead_times else doubt.dead
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": dead}
         known = {"noise": noise, "colour": colour, "load_moves": _load_moves(fitted.model, whole), **open_to}
         model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
@@ -224,10 +224,13 @@ def _likely(problem: Problem, selection: Selection, inputs: Sequence[Signal]) ->
     return {"dead_times": found} if found else {}
 
 
-def _dead_sd(selection: Selection, n_mv: int) -> float:
-    """Standard deviation [periods] of the MVs' dead times: half the way to the farthest one that is as likely."""
+def _later(selection: Selection, n_mv: int) -> float:
+    """Standard deviation [periods] of the MVs' dead times: half the way to the latest one that is as likely.
+
+    One that is less makes no loop swing: fast plants of the tests stand for it.
+    """
     rows = zip(selection.chosen.structure.delays[:n_mv], selection.dead_times, strict=False)
-    return max((max(most - d, d - least, 0) / 2 for d, (least, most) in rows), default=0.0)
+    return max((max(most - d, 0) / 2 for d, (_, most) in rows), default=0.0)
 
 
 def _unseen(mvs: Sequence[Signal], rows: ScaledRecord, scales: Scales) -> list[str]:
