@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -127,6 +129,7 @@ class Case(ABC):
     stand_in: ClassVar[str] = "identified"  # what they run on in the plant's place: such models, or a simulator
     reads: ClassVar[tuple[Path, ...]] = ()  # files, beside the code, that the tests run
     development_noise: ClassVar[bool] = False  # development runs have measurement noise too
+    development_geometric: ClassVar[bool] = False  # each sequence counts by its ratio, however large its errors are
     gone_wrong: ClassVar[tuple[str, ...]] = ()  # tests on plants that no law was told of: poor figures there are told
     ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}  # plant parameter -> where that of a real plant may lie
 
@@ -300,3 +303,9 @@ class Case(ABC):
     @abstractmethod
     def development(self) -> tuple[Scenario, ...]:
         """Sequences for tuning and for choosing among candidates; never scored."""
+
+    def developed(self, errors: Sequence[float]) -> float:
+        """The mean of a law's errors over the development sequences, nan of none; see ``development_geometric``."""
+        if not self.development_geometric or not errors:
+            return statistics.fmean(errors) if errors else math.nan
+        return statistics.geometric_mean(errors) if min(errors) > 0 else 0.0

@@ -299,7 +299,13 @@ class Evidence:
 
     def _beats_old_loop(self, errors: Mapping[str, float]) -> str:
         own, old = (f"{errors[law]:.3g} {self.case.unit}".rstrip() for law in (str(self.best), self.old_loop))
-        return f"its {self.case.criterion.short} over the development sequences is {own}, the old loop's {old}"
+        return f"{self._development} is {own}, the old loop's {old}"
+
+    @property
+    def _development(self) -> str:
+        """What ``LawEvidence.development`` is, in words."""
+        of = "the geometric mean of " if self.case.development_geometric else ""
+        return f"{of}its {self.case.criterion.short} over the development sequences"
 
     @property
     def why_best(self) -> str:
@@ -316,9 +322,8 @@ class Evidence:
             return "it has the lowest gate score of the laws that did not lock up"
         others = ", ".join(f"{n} {e:.3g}" for n, e in errors.items() if n != self.best)
         beside = f" (others: {others})" if others else ""
-        return (
-            f"its {self.case.criterion.short} over the development sequences, which are not scored, is the lowest: "
-            + (f"{errors[self.best]:.3g} {self.case.unit}".rstrip() + beside)
+        return f"{self._development}, which are not scored, is the lowest: " + (
+            f"{errors[self.best]:.3g} {self.case.unit}".rstrip() + beside
         )
 
     def loop(self, curve: Curve, scenario: str) -> Loop | None:

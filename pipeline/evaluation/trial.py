@@ -38,7 +38,7 @@ class Trial:
     info: tuple[str, ...]
     metrics: dict[str, Metrics]
     sequences: dict[str, dict[str, Metrics]]  # of the tests with several sequences, by their seeds
-    development: float  # the case's metric, mean over the development sequences
+    development: float  # the case's metric over the development sequences, see ``Case.developed``
     locked_up: dict[str, int]  # test -> closed loops that locked up, of those where any did; DEVELOPED: development
     swings: dict[str, int]  # the same of closed loops that swing to the end
     beyond_reach: dict[str, int]  # test -> holds that count as no lock-up, because no control gets to the set point

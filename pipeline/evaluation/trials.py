@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -138,7 +137,7 @@ class Trials:
             ran.info,
             metrics,
             sequences,
-            statistics.fmean(developed) if developed else float("nan"),
+            self.case.developed(developed),
             {name: count for name, count in locked_up.items() if count},
             {name: count for name, count in swings.items() if count},
             {name: count for name, count in beyond.items() if count},

@@ -92,6 +92,15 @@ def test_no_test_runs_on_the_law_s_own_model(heater: OwnCase) -> None:
     assert all(test.plant is heater.plant for test in heater.development())
 
 
+def test_no_development_sequence_decides_alone_however_large_its_errors_are(heater: OwnCase) -> None:
+    """Half the error on four sequences, twice the error on the last one, of a plant that nobody controls well."""
+    for size in (1.0, 1e3):
+        assert heater.developed([1.0] * 4 + [2 * size]) < heater.developed([2.0] * 4 + [size])
+    assert np.isnan(heater.developed([]))
+    assert heater.developed([0.0, 1.0]) == 0
+    assert all_cases()["batch_reactor"].developed([1.0, 5.0]) == 3  # of the papers' cases the plain mean
+
+
 def test_set_points_are_what_the_model_reaches_within_the_record(heater: OwnCase) -> None:
     low, high = np.quantile(heater.record.mv, (0.1, 0.9))
     for test in heater.scenarios()["held_out"]:
