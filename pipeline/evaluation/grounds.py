@@ -78,8 +78,10 @@ class Grounds:
 
         Where the models are proven later it stands as what it was: a doubt before there was a model.
         """
-        if self.record is None or not self.record.doubt or not self.proven:
-            return "" if self.record is None else self.record.doubt
+        if self.record is None:
+            return ""
+        if not self.proven or not self.record.doubt:
+            return self.record.doubt
         return f"the screening doubted these data ({'; '.join(self.record.reasons)}), and the models are proven since"
 
     @property

@@ -33,7 +33,7 @@ LATE = (0, 1, 0, 1, 0, 0)
 # As late as the record leaves open, and as the model in all else: a model with another dead time explains the record
 # alike, so that its gain and its pace are no further off. Slow plants of a high gain that were so late, too, cost 20 to
 # 40 % of error under loads where the model's dead time was right.
-FARTHEST = 5
+LATEST_LOOP = 5
 GAIN, PACE, DEAD = 0.25, 0.15, 0.5  # least errors; larger ones of pace and dead time calm loops that need no calm
 MOST = 1.0  # of each error
 LATEST = 0.25  # of the horizon, that plants answer later at most
@@ -207,7 +207,7 @@ def _errors(model: Identified, signs: Array, latest: float) -> tuple[Array, Arra
         for sd, least, most in ((model.gain_sd, GAIN, MOST), (model.pace_sd, PACE, MOST), (model.dead_sd, DEAD, latest))
     )
     late = DEAD * np.array(LATE, dtype=np.float64)
-    late[FARTHEST] = dead[0] if dead[0] > DEAD else 0.0
+    late[LATEST_LOOP] = dead[0] if dead[0] > DEAD else 0.0
     turned = np.tile(GAINS, 2)[:, None] * signs
     return (1 + gain) ** turned, (1 + pace) ** np.tile(PACES, 2)[:, None], np.tile(late, 2)[:, None]
 
