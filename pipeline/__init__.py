@@ -1,1 +1,1 @@
-"""From plants and plant data to published controllers. What runs them on a plant is ``serving``."""
+"""From plants and plant data to published controllers. ``serving`` runs them on a plant."""

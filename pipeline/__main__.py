@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _loaded(name: str) -> ModuleType:
-    """The module of a command. What it imports stays: looking through it for garbage took a sixth of the time."""
+    """The module of a command. Its imports stay: looking through them for garbage took a sixth of the time."""
     module = f"pipeline.commands.{name}"
     if (found := sys.modules.get(module)) is not None:  # frozen at each call, a caller's garbage would pile up
         return found

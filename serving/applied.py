@@ -23,7 +23,7 @@ UNREAD = "the last MV did not reach the plant: nothing is written before a good 
 
 
 class Shown(NamedTuple):
-    """What one sample shows of the MV."""
+    """The MV as one sample shows it."""
 
     applied: Array | None = None  # shape: (n_mv,), the read-back within its range; None where there is no sound one
     found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
@@ -51,7 +51,7 @@ class AppliedMV:
         self._standing.lost = True
 
     def command(self, mv: Array, *, written: bool) -> None:
-        """What is commanded now (n_mv,); whether it arrives is known at the next scan. A shadow writes nothing."""
+        """The command of now (n_mv,); whether it arrives is known at the next scan. A shadow writes nothing."""
         self._given, self._written = mv.copy(), written
 
     def arrived(self) -> None:
@@ -59,7 +59,7 @@ class AppliedMV:
         self._standing.commanded(self._given, written=self._written)
 
     def look(self, sample: Sample, last: Array, *, refused: bool) -> Shown:
-        """What the sample shows; ``last`` is the last command (n_mv,), ``refused`` whether the sample is of no use.
+        """The MV by the sample; ``last`` is the last command (n_mv,), ``refused`` whether the sample is of no use.
 
         A refused sample without a read-back tells nothing; a good one says that nothing is read back at all. Where it
         was not known where the MV stands, and it stands outside its range, somebody has moved it there. Nothing is

@@ -103,7 +103,7 @@ def _swings(evidence: dict[str, Any]) -> list[str]:
 
 
 def _doubtful(evidence: dict[str, Any]) -> list[str]:
-    """What the screening said of the record behind the models of the tests, unless it is good."""
+    """The screening's verdict on the record behind the models of the tests, unless it is good."""
     grounds = evidence.get("on")
     if not isinstance(grounds, dict) or grounds.get("data") in (None, "", "yes"):
         return []

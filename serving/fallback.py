@@ -1,4 +1,4 @@
-"""What a loop does when a fault lasts."""
+"""Action of a loop when a fault lasts."""
 
 from __future__ import annotations
 

@@ -51,9 +51,9 @@ def told_by(error: Exception, words: str) -> str:
 
 
 def kind_of(fault: str) -> tuple[str, ...]:
-    """What makes two faults the same one.
+    """The key by which two faults are the same one.
 
-    Of a plain text it is the text without the numbers that stand alone: those of a name, as in T-101, belong to it.
+    For a plain text it is the text without the numbers that stand alone: those of a name, as in T-101, belong to it.
     """
     return (fault.kind, fault.subject) if isinstance(fault, Fault) else (NUMBER.sub("#", fault),)
 

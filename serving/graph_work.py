@@ -1,8 +1,8 @@
 """Work of one step, known before anything runs: the shapes of all values from the constants and the inputs.
 
-A graph with static shapes has a fixed cost. What the file says of shapes in between is not used:
-each operator's result follows from its inputs by the rules of ONNX, opset 18 to 21. An operator whose
-result's shape is computed in the graph itself is refused.
+A graph with static shapes has a fixed cost. The file's statements on shapes in between are not used: each operator's
+result follows from its inputs by the rules of ONNX, opset 18 to 21. An operator whose result's shape is computed in the
+graph itself is refused.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """An ONNX file's bytes as plain values, read without the onnx package and more strictly than any other reader.
 
-ONNX is a protobuf, and protobuf parsers differ in what they accept: tags above 32 bits, numbers with
-needless bytes, singular fields that stand twice, unknown fields. What one parser skips, another one
-may execute. A protobuf has one canonical form, the one that serializers write: this reader accepts
-that form alone, and only fields of ``SCHEMA``. So every parser sees in an accepted file what this one sees.
+ONNX is a protobuf, and protobuf parsers differ in what they accept: tags above 32 bits, numbers with needless bytes,
+singular fields that stand twice, unknown fields. Bytes that one parser skips, another one may execute. A protobuf has
+one canonical form, the one that serializers write: this reader accepts that form alone, and only fields of ``SCHEMA``.
+So every parser sees in an accepted file what this one sees.
 """
 
 from __future__ import annotations

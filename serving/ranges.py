@@ -17,7 +17,7 @@ Array: TypeAlias = NDArray[np.float64]
 def numbers(given: object) -> NDArray[Any]:
     """``given`` as an array of integers or floats, of any shape.
 
-    TypeError, whose text goes on a name, for anything else. Of a truth value among numbers numpy makes a number; this
+    TypeError, whose text goes on a name, for anything else. Numpy makes a number of a truth value among numbers; this
     does not.
     """
     try:

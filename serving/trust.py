@@ -62,7 +62,7 @@ class Controller(controller.Controller):
 
 
 def signer(loaded: controller.Controller) -> Signed | None:
-    """Who signed a controller's file; None where nobody was asked."""
+    """Signer of a controller's file; None where nobody was asked."""
     if isinstance(loaded, Fitted):
         loaded = loaded.inner
     return loaded.signed if isinstance(loaded, Controller) else None

@@ -1,6 +1,6 @@
 """The cases by name, and their plants: adding one is a folder here and a line below.
 
-What a case draws or claims stands in its ``paper`` module, own kinds of model and excitations in
+The figures and claims of a case are in its ``paper`` module, own kinds of model and excitations in
 ``models`` and ``excitations``; ``beside`` loads them, so that the list itself needs neither torch nor matplotlib.
 """
 

@@ -15,7 +15,7 @@ ROOM = 0.05  # of an MV's range, at each end: what holding a disturbance leaves 
 
 
 def load_size(reach: Reach, cv: int) -> float:
-    """What a load changes of a CV [its unit] at most within a hold, if no controller acts.
+    """Largest change of a CV [its unit] by a load within a hold, if no controller acts.
 
     ``LOAD`` of the record's standard deviations; on a quiet record with much noise ``ABOVE_NOISE`` of the noise's,
     because a smaller one is lost in it.

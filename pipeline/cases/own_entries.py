@@ -1,4 +1,4 @@
-"""What params.yaml holds for an own plant: `loopwright new` writes it."""
+"""Entries of params.yaml for an own plant: `loopwright new` writes them."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class OwnPlant(IdentifiedPlant):
     def foreseen(self) -> int:
         """Samples after a move: as many as predictive control looks ahead at most, after the dead time.
 
-        Of what comes later a record with loads says little.
+        A record with loads says little of later samples.
         Without the dead time, an MV that acts after as many samples would seem not to act.
         """
         return MOST_PERIODS + longest_memory(self.arrays)

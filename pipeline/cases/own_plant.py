@@ -167,7 +167,7 @@ class OwnCase(OwnEnsemble):
     def _spoilt(self, plant: OwnPlant, seed: int, errors: Mapping[str, float]) -> tuple[Scenario, float]:
         """The test on a plant gone wrong, and the share of the errors: the largest that can be controlled.
 
-        That is: the plant rests at each set point, and a control that knows it gets there in each hold. Where it does
+        The plant then rests at each set point, and a control that knows it gets there in each hold. Where it does
         so with none of ``SHARES`` the errors are not to blame, and stay whole.
         """
         whole: Scenario | None = None
@@ -273,8 +273,8 @@ class OwnCase(OwnEnsemble):
     def development(self) -> tuple[Scenario, ...]:
         """Sequences on the law's own model as it is, and the first of them with errors too.
 
-        As it is, a law that knows it has no rival. With errors a law's error is several times as large: in a plain mean
-        the plant of the highest gain decided alone, which the plant of the record hardly ever is.
+        A law that knows the model has no rival there. With errors a law's error is several times as large: in a plain
+        mean the plant of the highest gain decided alone, which the plant of the record hardly ever is.
         """
         plant, first = self._nominal, self.development_seeds[:1]
         drawn = [(s, dict[str, float]()) for s in self.development_seeds]
@@ -320,7 +320,7 @@ def _held(name: str, params: PlantParams) -> dict[str, int]:
     """PV -> sign of the gain of its old PI, of a plant of one loop; empty where that is not known.
 
     An integral part that held its PV has the sign of the plant's own steady gain: with the other one the loop would
-    have run away. Of several loops it is the sign with the others at work, which need not be that of the plant.
+    have run away. With several loops it is the sign with the others at work, which need not be that of the plant.
     """
     if len(params.mv) > 1 or f"{name}-{OLD_LOOP}" not in sections_of("controllers", name):
         return {}

@@ -85,7 +85,7 @@ class SimulatedCase(OwnCase):
         return float(np.clip(load, min(at - signal.high + room, 0.0), max(at - signal.low - room, 0.0)))
 
     def _moved(self, plant: Simulator, name: str, size: float, cv: int) -> float:
-        """What a load changes of a CV over a hold, against the same hold without it."""
+        """Change of a CV by a load over a hold, against the same hold without it."""
         ends = []
         for load in (size, 0.0):
             (x, mv), p = plant.start, plant.parameters({name: load})

@@ -1,4 +1,4 @@
-"""What of a plant's range its record visited, and the set points and holds of tests that follow from it."""
+"""The part of a plant's range that its record visited, and the set points and holds of tests that follow from it."""
 
 from __future__ import annotations
 

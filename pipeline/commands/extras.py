@@ -12,7 +12,7 @@ OWN = ("dev",)  # which tests loopwright itself
 
 
 def advice(module: str) -> str | None:
-    """Which extra brings a module that is not installed, as the end of an error; None where no extra does."""
+    """The extra that brings a module that is not installed, as the end of an error; None where no extra does."""
     extra = extra_of(module)
     return f"{module.partition('.')[0]} is not installed; pip install '{NAME}[{extra}]' brings it" if extra else None
 

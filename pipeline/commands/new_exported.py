@@ -70,7 +70,7 @@ def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:
 
 
 def loop_lines(tags: Sequence[Tag]) -> list[str]:
-    """Which tags belong together, a line a loop, for a person to correct."""
+    """The tags that belong together, a line a loop, for a person to correct."""
     return [
         f"loop {loop}: {', '.join(f'{role} {tag}' for role in ROLES for tag in roles.get(role, ()))}"
         for loop, roles in loops_in(tags).items()

@@ -26,7 +26,7 @@ def tell(
 ) -> None:
     """Print the rows kept, what was found, the verdict, and where to look next; ``asked``: a question comes first.
 
-    What an engineer says that he knows is not asked for.
+    Statements of the engineer are not asked for again.
     """
     print(f"{name}: {report.summary}")
     takes = in_words(3600 * test.hours) if test else ""

@@ -66,8 +66,8 @@ def known_kept(plant: str, said: Stated, tags: Sequence[Tag]) -> tuple[tuple[Kno
 def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]], screening: Path) -> list[str]:
     """Settings that a person may have written and the new ``entries`` lack, as ``SECTION.NAME: key: value``.
 
-    Of a plant's controllers, where they may have other values too, and of how its export files are read. The numbers
-    of the old loop that `new` wrote itself, from the ``screening`` of the record before, are nobody's wish.
+    Keys of a plant's controllers, where they may have other values too, and of how its export files are read. The
+    numbers of the old loop that `new` wrote itself, from the ``screening`` of the record before, are nobody's wish.
     """
     if plant not in sections("plants"):
         return []

@@ -43,7 +43,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 def start_of(case: Case) -> tuple[Array, Array]:
     """State (n_x,) and MVs (n_mv,) that a case begins at: those of its first test, or the rest of an own plant.
 
-    PlantError where an own plant has no model yet. What stands in for an own plant is said on standard error.
+    PlantError where an own plant has no model yet. A stand-in for an own plant is named on standard error.
     """
     if not case.on_models:
         test = next(iter(case.scenarios().values()))[0]

@@ -25,8 +25,8 @@ class Known:
     """How ``pv`` answers to ``input``, an MV or a measured disturbance, as far as somebody knows.
 
     ``sign`` of its steady gain, of an integrating PV that of its slope; ``none``: the input does not move it. ``gain``:
-    the steady gain lies from .. to [PV/input]. ``dead_s``: the dead time lies from .. to [s]. What is left out is not
-    known. Raises ValueError where the statements contradict each other.
+    the steady gain lies from .. to [PV/input]. ``dead_s``: the dead time lies from .. to [s]. Fields that are left out
+    are not known. Raises ValueError where the statements contradict each other.
     """
 
     pv: str

@@ -85,7 +85,7 @@ class Commanded(Protocol):
 
 
 def mistakes_of_mv(mv: Commanded) -> list[str]:
-    """What cannot be in the numbers of an MV, a clause each."""
+    """Faults in the numbers of an MV, a clause each."""
     wrong = []
     low, high = (-math.inf if mv.low is None else mv.low), (math.inf if mv.high is None else mv.high)
     if not low < high:

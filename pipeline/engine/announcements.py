@@ -1,4 +1,4 @@
-"""What a person reads of a run: each stage by number and in words, in place of DVC's lines."""
+"""The lines of a run for a person: each stage by number and in words, in place of DVC's lines."""
 
 from __future__ import annotations
 

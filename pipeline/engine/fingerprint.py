@@ -1,4 +1,4 @@
-"""What a process runs: versions of what decides results, and a digest of the sources.
+"""Versions and sources of a process: versions of what decides results, and a digest of the sources.
 
 Results of a run must come of one code. A client sends its fingerprint with every task; a worker with another refuses.
 """
@@ -35,7 +35,7 @@ def fingerprint() -> Mapping[str, str]:
 
 
 def difference(ours: Mapping[str, str], theirs: Mapping[str, str]) -> str:
-    """What differs, in words: "torch 2.13.0 here and 2.12.1 there"; empty where nothing does."""
+    """The differences, in words: "torch 2.13.0 here and 2.12.1 there"; empty where nothing does."""
     names = sorted({*ours, *theirs})
     pairs = [(name, ours.get(name, "none"), theirs.get(name, "none")) for name in names]
     return ", ".join(f"{name} {_short(name, a)} here and {_short(name, b)} there" for name, a, b in pairs if a != b)

@@ -8,10 +8,10 @@ once those beside it have ended. Results are those of one lane.
 
 ``python -m pipeline.engine.lanes [--of STAGE,...] repro ARGUMENT...`` is one ``dvc repro ARGUMENT...``.
 
-What the lanes write comes line by line to one output, with each stage announced by its number among those ``of``
+The output of the lanes comes line by line, with each stage announced by its number among those ``of``
 which the run may have to run. After SIGINT or SIGTERM no line comes any more, and no stage begins. DVC itself is not
 interrupted while it may be writing down a finished stage: the run's door shuts, by which the stage that runs ends and
-the next is refused, so that DVC ends by itself. What DVC wrote before the signal says whether it had begun a stage.
+the next is refused, so that DVC ends by itself. The output of DVC before the signal says whether it had begun a stage.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
 
 @dataclass
 class _Lane:
-    """What is known of one DVC process."""
+    """The state of one DVC process."""
 
     line: bytearray = field(default_factory=bytearray)  # that it has begun to write
     ran: bool = False  # whether a stage ran, so that it may be writing dvc.lock

@@ -1,4 +1,4 @@
-"""What workers write to the terminal, until a run is stopped."""
+"""The output of workers on the terminal, until a run is stopped."""
 
 from __future__ import annotations
 

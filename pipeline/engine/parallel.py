@@ -1,6 +1,6 @@
 """Independent pieces of one stage, side by side on the engine's workers, with progress.
 
-Pieces are values in and bytes out. Which worker does one, and how many there are, changes no result.
+Pieces are values in and bytes out. The result depends neither on which worker does one nor on how many there are.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Task:
-    """What this thread of a worker does: the files that it began with, who waits for it, and in how many others.
+    """The work of this thread of a worker: the files that it began with, who waits for it, and in how many others.
 
     ``wanted`` says whether somebody still waits.
     """
@@ -127,7 +127,7 @@ class _Content:
 
 @dataclass
 class _Opened:
-    """What the pieces of a call share, on one worker."""
+    """Data that the pieces of a call share, on one worker."""
 
     function: Callable[[Any], Any]
     files: Files | None

@@ -26,7 +26,7 @@ FAILED = 2
 
 
 def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
-    """Run a stage on the cluster at an address; its exit status. What it says is said here, as it says it."""
+    """Run a stage on the cluster at an address; its exit status. Its output is printed here, line by line."""
     client, topic = connected(at), f"stage-{uuid.uuid4().hex[:12]}"
     # Outputs of a run before are no inputs: DVC removes them, by hand they may be there.
     read = read_files(files.reads)

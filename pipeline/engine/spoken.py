@@ -1,4 +1,4 @@
-"""What a stage says while a worker runs it: its lines go to the client that asked for it, not to the worker's log.
+"""Output of a stage while a worker runs it: its lines go to the client that asked for it, not to the worker's log.
 
 A worker's process holds several stages at a time, of which one at most runs; the others wait for their pieces. So what
 is said belongs to the thread that says it.

@@ -1,4 +1,4 @@
-"""Which files a stage of dvc.yaml reads and writes, so that a worker that has none of them can run it.
+"""Files that a stage of dvc.yaml reads and writes, so that a worker that has none of them can run it.
 
 ``deps`` and ``outs`` are DVC's. Under ``meta`` a stage that runs on the cluster lists what it reads beside them
 (``reads``: nothing that decides a result), or replaces without owning it (``replaces``).
@@ -23,7 +23,7 @@ _FIELD = re.compile(r"\$\{([\w.]+)\}")
 
 @dataclass(frozen=True)
 class StageFiles:
-    """What a stage finds in its folder, and what of the folder is anew afterwards."""
+    """Files that a stage finds in its folder, and those that are new afterwards."""
 
     reads: tuple[Path, ...]
     writes: tuple[Path, ...]

@@ -164,7 +164,7 @@ def last_half(*courses: Array) -> slice:
 
 
 def swings(sp: Array, cv: Array, span: Array, share: float = SWING, *, whole: bool = False) -> NDArray[np.bool_]:
-    """Which controlled variables (n, n_cv) still swing about their set points as the course ends.
+    """The controlled variables (n, n_cv) that still swing about their set points as the course ends.
 
     Over the last half of the last hold, or over the ``whole`` course, the error goes from one side to the
     other at least CROSSINGS times, each time beyond a ``share`` of ``span`` (n_cv,).

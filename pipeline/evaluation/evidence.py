@@ -87,7 +87,7 @@ class Evidence:
 
     @cached_property
     def grounds(self) -> Grounds | None:
-        """What tests on identified models rest on; None for a case that is tested on its plant's equations."""
+        """The basis of tests on identified models; None for a case that is tested on its plant's equations."""
         return grounds_of(
             self.case,
             next(iter(self.models.values()), {}),
@@ -225,7 +225,7 @@ class Evidence:
 
     @property
     def relative_to(self) -> RelativeTo:
-        """What gate scores are relative to: on a simulator, which has no NMPC, the baseline, or else the noise."""
+        """The reference of gate scores: on a simulator, which has no NMPC, the baseline, or else the noise."""
         if not self.simulated:
             return "nmpc"
         return "baseline" if self.case.baseline in self.laws else "floor"
@@ -303,7 +303,7 @@ class Evidence:
 
     @property
     def _development(self) -> str:
-        """What ``LawEvidence.development`` is, in words."""
+        """The figure ``LawEvidence.development``, in words."""
         of = "the geometric mean of " if self.case.development_geometric else ""
         return f"{of}its {self.case.criterion.short} over the development sequences"
 

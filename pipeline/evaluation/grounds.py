@@ -1,4 +1,4 @@
-"""What figures of tests on identified models rest on: the models' free-run fit, and what lies beyond the data."""
+"""The basis of figures of tests on identified models: the models' free-run fit, and what lies beyond the data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ON_MODELS = "on models identified from your data"
 
 @dataclass(frozen=True, slots=True)
 class RecordVerdict:
-    """What the screening said of a plant's record.
+    """The verdict of the screening on a plant's record.
 
     ``carries``: whether it can carry a model, yes, doubtful or no; ``reasons``: why not yes, a clause each;
     ``operated``: how the plant was run, a clause for each loop whose set point is known; ``old_controllers``: the law

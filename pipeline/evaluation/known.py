@@ -1,4 +1,4 @@
-"""What an engineer knows of the plant, as requirements: beside the model of its record, and as a question."""
+"""An engineer's knowledge of the plant, as requirements: beside the model of its record, and as a question."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def known_rows(models: Mapping[str, Metrics]) -> list[Statement]:
 
 
 def question(models: Mapping[str, Metrics]) -> str:
-    """What to ask of statements that the record is certain to contradict, to go on a sentence; empty if nothing."""
+    """The question on statements that the record is certain to contradict, to go on a sentence; empty without any."""
     asked = [of["question"] for of in _statements(identified_part(models).get("proof") or {}) if "question" in of]
     return f"not proven: {'; '.join(asked)}" if asked else ""
 

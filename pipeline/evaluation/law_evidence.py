@@ -203,7 +203,7 @@ class LawEvidence:
     def loop(self, scenario: str, setting: Mapping[str, Any]) -> Loop | None:
         """Trajectory of the shipped data seed, arrays (n, ...) by field; None where none was stored.
 
-        Of a test of several sequences, or of several draws of the noise, it is the first.
+        The first one, where a test has several sequences or several draws of the noise.
         """
         start = f"{scenario}/{self.form_of(setting)}/{self.metrics.shipped_seed}/"
         return arrays(self.trajectories, start) or None

@@ -40,9 +40,9 @@ def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Si
 def before_turns(signals: Signals, values: Array, curves: Array, visited: tuple[float, float]) -> Signals:
     """The signals of a plant of one MV, whose range ends where a model of the record has its first turn.
 
-    ``curves`` (models, n) are what the models' CV reaches under rising values (n,) of the MV. What is ``visited``
-    (lowest, highest) remains: there the record judges, see ``on_one_side``. Outside of it nobody knows whether the
-    turn is the plant's, but a law on that model locks up behind it.
+    ``curves`` (models, n) are what the models' CV reaches under rising values (n,) of the MV. The ``visited`` part
+    (lowest, highest) remains: there the record judges, see ``on_one_side``. Outside of it nobody knows whether the turn
+    is the plant's, but a law on that model locks up behind it.
     """
     mv, (first, middle, last) = signals.mv[0], np.searchsorted(values, [visited[0], 0.5 * sum(visited), visited[1]])
     first, last = max(min(first, middle - 1), 0), min(max(last, middle + 1), len(values) - 1)

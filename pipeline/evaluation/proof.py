@@ -49,7 +49,7 @@ def sign_doubts(models: Mapping[str, Metrics]) -> str:
 
 
 def fit_doubts(models: Mapping[str, Metrics]) -> str:
-    """What the predictions miss, to go on a sentence; empty if they miss little."""
+    """The part that the predictions miss, to go on a sentence; empty if it is small."""
     proof = identified_part(models).get("proof") or {}
     one_step = proof.get("one_step") or {}
     rows = {name: row.measured for name, row in _predictions(proof).items() if not row.holds}
@@ -109,8 +109,8 @@ def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -
     """Whether nothing speaks against an answer.
 
     Where the inputs are ``shown`` to foresee the PV over rows that no fit saw, and all models that are as likely have
-    one sign, one-step predictions need not be as certain of it by themselves. What an engineer says decides what the
-    record leaves uncertain; a model of another sign than said holds nowhere.
+    one sign, one-step predictions need not be as certain of it by themselves. An engineer's statement decides where the
+    record leaves it uncertain; a model of another sign than said holds nowhere.
     """
     if known and known["way"] * found["model"] < 0:
         return False
@@ -200,7 +200,7 @@ def _regions(mv: str, found: Mapping[str, Any]) -> list[str]:
 
 
 def _by_regions_why(found: Mapping[str, Any], *, shown: bool, holds: bool) -> str:
-    """What is so of a gain that changes within the range, and what speaks against it."""
+    """Facts on a gain that changes within the range, and reasons against it."""
     changes = "turns its sign" if found["verdict"] == "turns" else "fades"
     against = (
         "" if holds else ", and the record shows too little of it" if shown else ", and the model predicts too little"
@@ -209,7 +209,7 @@ def _by_regions_why(found: Mapping[str, Any], *, shown: bool, holds: bool) -> st
 
 
 def _word(found: Mapping[str, Any], known: Mapping[str, Any], *, holds: bool) -> str:
-    """What an engineer's word has decided of an answer; empty where it has not."""
+    """The part of an answer that an engineer's word has decided; empty without one."""
     if known and known["way"] * found["model"] < 0:
         return f"an engineer says {known['says']!r}, and the model has the other sign"
     if decides(known, found):
@@ -220,7 +220,7 @@ def _word(found: Mapping[str, Any], known: Mapping[str, Any], *, holds: bool) ->
 
 
 def _why(pv: str, mv: str, found: Mapping[str, Any]) -> str:
-    """What speaks against an answer; empty where nothing does."""
+    """Reasons against an answer; empty without any."""
     verdict, share = found["verdict"], found["follows"]
     if verdict == "proven":
         return ""

@@ -21,7 +21,7 @@ AT_END = 1e-3  # of an MV's range
 
 
 class Steps(Protocol):
-    """What steps a control law: ``serving.Controller``."""
+    """An object that steps a control law: ``serving.Controller``."""
 
     def cold_state(self) -> Array:
         """The state of no past."""
@@ -41,7 +41,7 @@ class Replay:
     done: Array  # (n, n_mv) recorded
 
     def figures(self, mvs: Sequence[Signal]) -> dict[str, dict[str, float]]:
-        """Of each MV: distance of asked from done and its mean [% of range], correlation, share at an end [%].
+        """For each MV: distance of asked from done and its mean [% of range], correlation, share at an end [%].
 
         ``mvs`` are the law's, with the ranges that it commands. The correlation is left out where either never moved.
         """

@@ -54,7 +54,7 @@ class Trial:
 
     @property
     def development_lock_ups(self) -> int:
-        """Of them those over the development sequences."""
+        """The ones of these over the development sequences."""
         return self.locked_up.get(DEVELOPED, 0)
 
 

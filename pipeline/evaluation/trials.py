@@ -41,7 +41,7 @@ class Piece:
 
 @dataclass(frozen=True)
 class Ran:
-    """What a piece brings; the first sequence of a test alone brings its curve."""
+    """The result of a piece; the first sequence of a test alone brings its curve."""
 
     info: tuple[str, ...]
     metrics: Metrics
@@ -70,7 +70,7 @@ class Trials:
         return {"scored": self.case.scenarios(), "shown": shown, DEVELOPED: {DEVELOPED: self.case.development()}}
 
     def pieces(self, form: str, seed: int, path: Path) -> list[Piece]:
-        """What the trial of one file consists of."""
+        """The pieces of the trial of one file."""
         found = list[Piece]()
         for kind, tests in self.sequences.items():
             for name, sequences in tests.items():
@@ -103,7 +103,7 @@ class Trials:
         return Ran(controller.manifest.info, one.metrics, *counts, one.first if kept else None, reached, cycle)
 
     def weight(self, piece: Piece) -> float:
-        """What a piece costs beside others: its samples."""
+        """The cost of a piece beside others: its samples."""
         samples = self.sequences[piece.kind][piece.test][piece.place].samples
         return float(samples * (self.case.noise_draws if piece.noise else 1))
 

@@ -15,7 +15,7 @@ SCHEMA = 1
 """It changes with the meaning of an entry; a new entry with a default does not change it."""
 FILE = "validation.json"
 RelativeTo: TypeAlias = Literal["nmpc", "baseline", "floor"]
-"""What a gate score is relative to: the perfect-model NMPC; the baseline; or the error that noise can hide."""
+"""The reference of a gate score: the perfect-model NMPC; the baseline; or the error that noise can hide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class GateResult:
 
 
 def reference_words(relative_to: RelativeTo, baseline: str) -> str:
-    """What a gate score is a multiple of, in words; ``baseline`` is the name of the case's baseline."""
+    """The unit of a gate score, in words; ``baseline`` is the name of the case's baseline."""
     return {"nmpc": "the bound", "baseline": f"the {baseline}'s error", "floor": "the error that noise can hide"}[
         relative_to
     ]
@@ -101,7 +101,7 @@ class GateRecord:
 
     @property
     def reference(self) -> str:
-        """What a score is a multiple of, in words."""
+        """The unit of a score, in words."""
         return reference_words(self.relative_to, self.baseline_name)
 
     @property

@@ -22,7 +22,7 @@ CROSSED = 0.1  # of the PV's range: a plant that does not settle is measured by 
 
 @dataclass(frozen=True, slots=True)
 class FirstTest:
-    """What single steps from the start show; lists in the order of the signals."""
+    """Findings of single steps from the start; lists in the order of the signals."""
 
     settling_periods: int  # of the slowest answer; of a plant that does not settle, to cross CROSSED of a PV's range
     settles: bool
@@ -107,7 +107,7 @@ def _course(plant: Simulator, mv: Array, periods: int, *, within: bool = False) 
 
 
 def _settled(plant: Simulator, base: Array, mv: Array) -> tuple[Array, bool]:
-    """What a step changes (n, n_pv), over a run long enough to settle, and whether it does."""
+    """Changes (n, n_pv) by a step, over a run long enough to settle, and whether it does."""
     length, change = SHORT, np.zeros((0, base.shape[1]))
     while length <= LONGEST:
         course = _course(plant, mv, length)

@@ -54,8 +54,8 @@ def excited(plant: Simulator, plan: Plan, seed: int = 0) -> Record:
     Each MV holds levels that are uniform over its range for times that are uniform in their logarithm; each measured
     disturbance does so over its own range. Before a level is set it is tried on the plant's state up to the next move
     and ``look`` periods more; one that leads a PV within RIM of an end of its range is drawn again. So a tank that
-    integrates does not run over. Of TRIES levels that all lead out, the one that stays inside longest is set, for half
-    of that time.
+    integrates does not run over. Where TRIES levels all lead out, the one that stays inside longest is set, for half of
+    that time.
     """
     rng = np.random.default_rng(seed)
     n, (x, mv0), p = plan.samples, plant.start, plant.parameters()

@@ -27,9 +27,10 @@ GATE_STEPS = 1_000
 GATE_TOLERANCE = 1e-9
 TOGETHER = 200  # steps of a law side by side: more would leave the caches
 INFO_TOLERANCE = 1e-6
-"""Of info. It is shown and never fed back, so a difference cannot grow; but entries such as tau_i = Kp/Ki are
-ratios of small differences, which carry the rounding of their terms a thousand times enlarged. One part in a
-million of an entry's largest value is far below what a wrong formula changes, and below what anybody reads off."""
+"""Tolerance of info. It is shown and never fed back, so a difference cannot grow; but entries such as
+tau_i = Kp/Ki are ratios of small differences, which carry the rounding of their terms a thousand times enlarged. One
+part in a million of an entry's largest value is far below what a wrong formula changes, and below what anybody reads
+off."""
 
 
 def export(
@@ -165,7 +166,7 @@ def parity_gate(
 def _visited(
     law: ControlLaw, controller: Controller, steps: int, drive: Callable[[Array], Array] | None
 ) -> tuple[dict[str, Array], Array]:
-    """What each step of the controller's loop is given, (steps, n) each, and what it answers (steps, m)."""
+    """Inputs of each step of the controller's loop, (steps, n) each, and its answers (steps, m)."""
     signals, rng = law.signals, np.random.default_rng(0)
     courses = {"sp": _course(signals.sp, rng, 1 / 40), "pv": _course(signals.pv, rng), "dv": _course(signals.dv, rng)}
     applied, state = np.array([s.middle for s in signals.mv]), np.zeros(law.n_state)

@@ -1,4 +1,4 @@
-"""What a closed loop needs of a plant as two ONNX graphs: one sampling period, and what is measured."""
+"""The plant of a closed loop as two ONNX graphs: one sampling period, and what is measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``exports.<plant>`` and ``plants.<plant>`` of params.yaml both say: names, units, ranges, period."""
+"""Statements that ``exports.<plant>`` and ``plants.<plant>`` of params.yaml share: names, units, ranges, period."""
 
 from __future__ import annotations
 

@@ -80,8 +80,8 @@ def noise_sd(values: Array) -> float:
 def slips_of(values: Array, role: str) -> tuple[Where, Counter[str]]:
     """``unit_slips`` of finite readings (n,) of a tag with a role.
 
-    Of an MV few conversions count, and its zeros do not, nor those of a measured disturbance: a closed valve and a flow
-    that stopped are 0 in every unit.
+    For an MV few conversions count, and its zeros do not, nor those of a measured disturbance: a closed valve and a
+    flow that stopped are 0 in every unit.
     """
     counts = values != 0.0 if role in {"mv", "dv"} else np.ones(len(values), dtype=bool)
     where = np.zeros(len(values), dtype=bool)

@@ -1,4 +1,4 @@
-"""What a signal's values look like: steps of a converter, compression, stuck and clipped stretches."""
+"""The look of a signal's values: steps of a converter, compression, stuck and clipped stretches."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def smallest_difference(values: Array) -> float:
 def noisy(values: Array) -> bool:
     """Whether noise larger than the converter's step moves the values (n,): second differences change their sign.
 
-    Of white noise 73 % of them do; a smooth curve's keep it, and those of a coarse converter are its steps.
+    In white noise 73 % of them do; a smooth curve's keep it, and those of a coarse converter are its steps.
     """
     v = values[np.isfinite(values)][:SAMPLE]
     second = np.diff(v, 2)
@@ -111,8 +111,8 @@ def clipped(values: Array, low: float | None, high: float | None) -> tuple[Where
     """Where (n,) values stand at an end, and of each end its value and rows.
 
     An end is the range that was given, or the largest (smallest) value, where that is repeated at least CLIPPED_ROWS
-    rows on end and three times as often as all values within the next 2 % of the span. Of values that move in steps,
-    each held, only the range that was given is an end: the largest step is none.
+    rows on end and three times as often as all values within the next 2 % of the span. Where values move in steps, each
+    held, only the range that was given is an end: the largest step is none.
     """
     where, ends = np.zeros(len(values), dtype=bool), list[tuple[float, int]]()
     finite = values[np.isfinite(values)]

@@ -46,7 +46,7 @@ class Windows:
 
     @classmethod
     def of(cls, y: Array, expected: Array, length: int) -> Windows:
-        """Of a PV y (n,) and its expected values (n,); windows with too many gaps are left out."""
+        """From a PV y (n,) and its expected values (n,); windows with too many gaps are left out."""
         part = max(length // STEPS, 1)
         m = len(y) // part
         ok = np.isfinite(y[: m * part]) & np.isfinite(expected[: m * part])

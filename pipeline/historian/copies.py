@@ -25,9 +25,9 @@ FACTOR = 0x9E3779B97F4A7C15
 def drop_copies(own: Mapping[str, Series], tags: Sequence[Tag]) -> list[Finding]:
     """Readings of PVs that repeat a block of earlier ones get their reason; the first of each stays.
 
-    A value with noise larger than its converter's step does not repeat by chance. Of a coarser PV the whole row must
-    repeat, every signal with the same stamps, and one of them must have such noise: a motion that was made again
-    looks the same, and both are good.
+    A value with noise larger than its converter's step does not repeat by chance. For a coarser PV the whole row must
+    repeat, every signal with the same stamps, and one of them must have such noise: a motion that was made again looks
+    the same, and both are good.
     """
     found = []
     pvs = {t.tag for t in tags if t.role == "pv"}

@@ -46,7 +46,7 @@ class DirectModel:
 
     @classmethod
     def of(cls, y: Array, u: Array, run: NDArray[np.int64], longest: int = 40) -> DirectModel | None:
-        """Of a PV y (n,) and all its inputs u (n, m), with lags up to ``longest`` rows; None where rows are too few."""
+        """Fit to a PV y (n,) and its inputs u (n, m), with lags up to ``longest`` rows; None where rows are too few."""
         longest = min(max(longest, SHORTEST), LONGEST)
         while True:
             blocks = blocks_to(longest)

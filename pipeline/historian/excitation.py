@@ -105,7 +105,7 @@ def _unsure(pv: str, model: Linear, inputs: list[InputReport]) -> bool:
 def with_rows_out_of_range(verdict: Verdict, dropped: int, rows: int) -> Verdict:
     """The verdict, "doubtful" at best where many rows were dropped because a reading left a range that was given.
 
-    What is left is what the plant does inside the range, and every excursion is torn out of its course.
+    The rest is the plant inside the range, and every excursion is torn out of its course.
     """
     if dropped <= OUT_OF_RANGE * rows:
         return verdict

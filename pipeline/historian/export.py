@@ -42,7 +42,7 @@ class Series:
 
     @property
     def good(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """Which readings are good, shape (n,)."""
+        """The readings that are good, shape (n,)."""
         return self.code == Reason.GOOD
 
     def counts(self) -> dict[str, int]:
@@ -76,7 +76,7 @@ class Note(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Contents:
-    """What one file holds of the tags that were asked for, in how many rows, and from when to when [s]."""
+    """The tags of one file among those asked for, in how many rows, and from when to when [s]."""
 
     path: str
     tags: frozenset[str]
@@ -105,9 +105,9 @@ def in_order(series: Series, files: NDArray[np.int64] = NO_CUTS) -> Series:
     """The readings sorted by time; of equal times the last good one stays, the others are DUPLICATE.
 
     Two passes over the same time with other values are CLOCK, both of them: a clock was set back, or zones are mixed.
-    What one pass holds and another one too was sent again: the first stays, the others are DUPLICATE. What is left and
-    shares rounded stamps in equal numbers is spread evenly over them. ``files`` are the readings, (m,), with which the
-    second and later files begin; where the times are in disorder, a file counts as a pass.
+    Rows in two passes were sent again: the first stays, the others are DUPLICATE. The rest that shares rounded stamps
+    in equal numbers is spread evenly over them. ``files`` are the readings, (m,), with which the second and later files
+    begin; where the times are in disorder, a file counts as a pass.
     """
     t = series.time_s
     back = np.flatnonzero(np.diff(t) < 0)

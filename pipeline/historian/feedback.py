@@ -1,8 +1,8 @@
 """Whether the MVs of a record follow its PVs: feedback, of a controller or of a careful operator.
 
-What u(k) and y(k) share beyond the past may be the controller's answer to y(k), or the plant's answer to u(k) where
-it acts within the row. A controller pushes against what it sees: its share has the sign opposite to the answer that
-the plant gives in later rows.
+A correlation of u(k) and y(k) beyond the past may be the controller's answer to y(k), or the plant's answer to u(k)
+where it acts within the row. A controller pushes against what it sees: its share has the sign opposite to the answer
+that the plant gives in later rows.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ FED_BACK = 0.1  # share of the clipped moves that the PVs' past explains
 def follows(u: Array, y: Array, run: Runs) -> float:
     """Share of the variance of u(k) - u(k-1) that y(k) and the rows before explain beyond u's own past: feedback.
 
-    Both (n,); 0 where the input never moves. Of a plant that answers within the row, what y(k-1) and the rows before
-    explain. Rows without a reading end a run.
+    Both (n,); 0 where the input never moves. The part that y(k-1) and the rows before explain, of a plant that answers
+    within the row. Rows without a reading end a run.
     """
     u, y, run = _read(u, y, run)
     with_row, earlier = _shares(np.diff(u, prepend=u[:1]), u, y, run)
@@ -40,7 +40,7 @@ def follows(u: Array, y: Array, run: Runs) -> float:
 def fed_back(u: Array, y: Array, run: Runs) -> bool:
     """Whether any MV of u (n, n_mv) follows any PV of y (n, n_pv) in the rows in which neither is moved by hand.
 
-    As ``follows``, of moves within ``CLIPPED`` typical ones: a step of a set point is rare and large, and hides what
+    Like ``follows``, of moves within ``CLIPPED`` typical ones: a step of a set point is rare and large, and hides what
     the controller does in all other rows. Rows in which the MV stands are those of a hand, or of a step test, and say
     nothing of a controller in the others; an MV that stands in nearly all of them follows nothing.
     """

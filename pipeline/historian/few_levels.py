@@ -16,7 +16,7 @@ SWITCHED = ((0.0, 1.0), (0.0, 100.0))  # what an on-off valve is often written a
 
 
 def on_off(record: Record, tags: Sequence[Tag]) -> tuple[str, ...]:
-    """Of each MV that looks like an on-off valve, what it is and what to do; ``tags`` have the stated ranges."""
+    """For each MV that looks like an on-off valve: the finding, and the remedy; ``tags`` have the stated ranges."""
     return tuple(
         f"{s.name} is {levels[0]:.4g} or {levels[1]:.4g} {s.unit}".rstrip(" -")
         + " in all rows and looks like an on-off valve; predictive control and the PID move an MV continuously: give "

@@ -1,4 +1,4 @@
-"""Which quick linear model of a PV to believe: one that rests, one that integrates, or one beside a slow drift."""
+"""Choice among quick linear models of a PV: one that rests, one that integrates, or one beside a slow drift."""
 
 from __future__ import annotations
 

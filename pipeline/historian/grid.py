@@ -246,7 +246,7 @@ def _held(
 
 
 def _reasons(at: Array, s: Series, out: Array, h: float) -> Codes:
-    """Of rows without a value, the reason of the bad reading nearest to them within a period; else GAP."""
+    """For rows without a value, the reason of the bad reading nearest to them within a period; else GAP."""
     code = np.zeros(len(at), np.uint8)
     lost = np.flatnonzero(~np.isfinite(out))
     if not lost.size:

@@ -1,4 +1,4 @@
-"""What a record says of an engineer's statements: one-step predictions of its rows agree, leave it open, or object."""
+"""A record beside an engineer's statements: one-step predictions of its rows agree, leave it open, or object."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Beside:
 
     @property
     def question(self) -> str:
-        """What to ask; empty where nothing speaks against the statement."""
+        """The question to ask; empty where nothing speaks against the statement."""
         return "" if self.objection is None else self.known.question(*self.objection)
 
     @property
@@ -48,7 +48,8 @@ def beside_record(known: Sequence[Known], record: Record) -> list[Beside]:
     """Each statement beside the record.
 
     A sign is contradicted by an answer that is certain to have the other one and keeps it in the last window; ``none``
-    by one that is certain to be more than ``NOTHING``. Of a gain an answer that has not settled can only be too large.
+    by one that is certain to be more than ``NOTHING``. A stated gain can only be too large for an answer that has not
+    settled.
     """
     pvs, inputs = [s.name for s in record.pv_signals], [s.name for s in (*record.mv_signals, *record.dv_signals)]
     moves, found = np.hstack([record.mv, record.dv]), list[Beside]()

@@ -1,4 +1,4 @@
-"""Which column of a file is time, which are values, and which qualities: a column a tag, or a row a reading."""
+"""Columns of a file: time, values and qualities, a column a tag, or a row a reading."""
 
 from __future__ import annotations
 

@@ -166,7 +166,7 @@ def lead(model: Linear, y: Array, u: Sequence[Array], i: int) -> tuple[float, in
 
 
 def _lines(rows: NDArray[np.int64], knots: int) -> list[Array]:
-    """Of each knot but the first, a line (n,) over the rows that is 1 there and 0 at the others."""
+    """For each knot but the first, a line (n,) over the rows that is 1 there and 0 at the others."""
     at = np.linspace(rows[0], rows[-1], max(knots, 1))
     return [np.interp(rows, at, unit) for unit in np.eye(max(knots, 1))[1:]]
 

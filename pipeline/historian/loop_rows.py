@@ -59,7 +59,7 @@ def set_points(
 ) -> SetPoints:
     """The set points in the rows of the record, of loops whose mode is known or whose PV is among those ``worked`` on.
 
-    Of the others nobody knows whether their set points were followed.
+    Nobody knows of the others whether their set points were followed.
     """
     known = [loop for loop in loops(grid, code, tags, modes) if loop.automatic or loop.pv.name in worked]
     columns = [np.where(loop.rows, grid.value[loop.sp.tag], np.nan)[code == 0] for loop in known]

@@ -28,7 +28,8 @@ def sentinels(values: Array, tag: Tag) -> tuple[Where, Counter[str]]:
     """Where (n,) codes for a missing value stand, and how often each.
 
     A code is one of CODES, zero, or a value that comes again exactly, farther from the usual ones than FAR of their
-    spans. What an actuator can do is none: a manipulated variable may be zero, and often at an end of its range.
+    spans. A value that an actuator can take is none: a manipulated variable may be zero, and often at an end of its
+    range.
     """
     low, high = core(values[values != 0.0])  # zeros of a dead sensor must not widen it
     span = max(high - low, 1e-6 * max(abs(low), abs(high), 1e-9))

@@ -63,7 +63,7 @@ class Opened:
             ) from None
 
     def layout(self, time_column: str = "", time_format: str = "") -> Layout:
-        """Which column is what; ``time_column`` and ``time_format`` are what a person said, "" for nothing."""
+        """The role of each column; ``time_column`` and ``time_format`` are those that a person gave, "" for none."""
         return layout_of(self.path, self.header, self.sample, time_column, time_format, self.units,
                          self.spread, self.counted)  # fmt: skip
 

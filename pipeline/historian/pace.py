@@ -87,7 +87,7 @@ class Pace:
 
 
 def of_period(pace: Pace, period_s: float, step_s: float, *, given: bool) -> list[Finding]:
-    """What the record's period is and why, where it is not the export's own or short for the plant."""
+    """The record's period and its reason, where it is not the export's own or short for the plant."""
     slowest = pace.slowest
     if slowest is None:
         return _undecided(pace, step_s, given=given)
@@ -130,9 +130,9 @@ def in_words(seconds: float) -> str:
 def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) -> Pace:
     """The pace of the plant, by an excerpt of the readings of its signals; ``step_s`` between those of the PVs.
 
-    The linear models of ``fitted`` see the rows as they are and thinned out. Of fast rows they learn the noise, and of
-    sparse ones the settling is no more than a row or two; so the sparsest count by which an answer is resolved.
-    No answer where the readings give no rows.
+    The linear models of ``fitted`` see the rows as they are and thinned out. From fast rows they learn the noise, and
+    in sparse ones the settling is no more than a row or two; so the sparsest count by which an answer is resolved. No
+    answer where the readings give no rows.
     """
     pv, mv, dv = ([series[t.tag] for t in tags if t.role == role] for role in ("pv", "mv", "dv"))
     cut = readings_of(pv, (*pv, *mv, *dv), step_s)

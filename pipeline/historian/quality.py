@@ -51,7 +51,7 @@ UNUSED = "does not tell which of its values is good, and is not used"
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """Which texts of a quality's column say good; None where it says nothing of quality. ``says`` is the choice."""
+    """The texts of a quality's column that say good; None where it says nothing of quality. ``says`` is the choice."""
 
     good: frozenset[str] | None
     says: str = ""
@@ -78,7 +78,7 @@ def names_a_state(column: str) -> bool:
 
 
 def meaning_of(column: str, counts: Mapping[str, int]) -> Meaning:
-    """What the texts of one column, and how often each stands there, say of quality.
+    """The quality that the texts of one column, and how often each stands there, mean.
 
     Words: good, ok, valid and their like. Numbers from 2^30 on, and hexadecimal ones: OPC UA, of which 0 is good.
     Smaller ones from 64 on: OPC classic, of which 192 is good, or percent. Flags (0 and 1, true and false) mean what

@@ -82,7 +82,7 @@ def read_export(
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """What a person said of the times: their column, their form, their zone; "" and None where nothing was said."""
+    """A person's statements on the times: their column, their form, their zone; "" and None without one."""
 
     column: str
     form: str
@@ -92,7 +92,7 @@ class Times:
 
 @dataclass(slots=True)
 class FileRead:
-    """What one file holds."""
+    """Content of one file."""
 
     kind: str  # of its layout
     contents: Contents

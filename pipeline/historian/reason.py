@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Reason(IntEnum):
-    """What is wrong with a reading of a tag or with a row of the record; GOOD is nothing.
+    """Fault of a reading of a tag or of a row of the record; GOOD is none.
 
     A reading has the first reason that was found, in this order.
     """

@@ -16,7 +16,7 @@ LEAST_SHARED = 0.05  # of the commanded or the visited range, the smaller one: w
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """What is wrong with a record, and which help there is."""
+    """Faults of a record, and the remedies."""
 
     why: str
     step_test: bool = False  # a step test gives a better one

@@ -1,4 +1,4 @@
-"""What is named and not dropped: compression, repeated values, coarse steps, a shifted MV."""
+"""Findings that are named while nothing is dropped: compression, repeated values, coarse steps, a shifted MV."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Re
 
 
 def _remedy(counts: NDArray[np.int64]) -> str:
-    """What to do, by the reason that most rows have; short pieces follow from the others."""
+    """Remedies, by the reason that most rows have; short pieces follow from the others."""
     causes = {r: int(counts[r]) for r in Reason if r not in {Reason.GOOD, Reason.SHORT_RUN}}
     most = max(causes, key=lambda r: causes[r])
     if most == Reason.MODE:

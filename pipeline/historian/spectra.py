@@ -20,7 +20,7 @@ BAND = (0.1, 3.0)  # of the plant's corner frequency
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Spectrum:
-    """Of one input and one PV over frequencies f (m,) [1/row]: shares of the input's power, and the coherence.
+    """Spectra of one input and one PV over frequencies f (m,) [1/row]: shares of the input's power, and the coherence.
 
         coherence(f) = |P_uy|^2 / (P_uu P_yy),   P = S^-1
 

@@ -143,7 +143,7 @@ def _of_stops(
 
 
 def _of_rests(pvs: Sequence[Tag], mvs: Sequence[Tag], texts: Sequence[str]) -> list[Finding]:
-    """What a person may leave out: stretches that may be a stop of the plant, or say most of it."""
+    """Rows that a person may leave out: stretches that may be a stop of the plant, or say most of it."""
     if not texts:
         return []
     options = " ".join(f"--leave-out {text}" for text in texts[:NAMED])

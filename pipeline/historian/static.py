@@ -1,4 +1,4 @@
-"""What the inputs alone explain of a PV: its answer to their past, without its own."""
+"""The part of a PV that the inputs alone explain: its answer to their past, without its own."""
 
 from __future__ import annotations
 

@@ -87,7 +87,7 @@ class Tag:
 
     @property
     def commands(self) -> dict[str, float]:
-        """What of a controller's limits was given, by its name in params.yaml."""
+        """The controller's limits that were given, by their names in params.yaml."""
         given = {name: getattr(self, name) for name in COMMANDS}
         return {name: value for name, value in given.items() if value is not None}
 
@@ -98,7 +98,7 @@ class Tag:
 
 
 class Look(Enum):
-    """What the readings of a tag look like."""
+    """The look of a tag's readings."""
 
     TEXTS = "texts instead of numbers"
     NOTHING = "no good reading"
@@ -120,7 +120,7 @@ class Guess:
 
     @property
     def remark(self) -> str:
-        """What was seen and guessed, for a person."""
+        """Findings and guesses, for a person."""
         return "; ".join(filter(None, (self.look.value, *self.notes)))
 
     def as_role(self, role: str, note: str = "") -> Guess:
@@ -331,7 +331,7 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
 
 
 def _wrong(tag: Tag) -> list[str]:
-    """What cannot be in the numbers of a tag, a clause each."""
+    """Faults in the numbers of a tag, a clause each."""
     if tag.role != "mv" and tag.commands:
         verb, it = ("belong", "them") if len(tag.commands) > 1 else ("belongs", "it")
         return [f"{', '.join(tag.commands)} {verb} to an mv, which the controller commands; leave {it} empty"]

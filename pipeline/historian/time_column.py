@@ -1,4 +1,4 @@
-"""Which column of an export is its time: dates before numbers, a column that rises before one that does not."""
+"""The time column of an export: dates before numbers, a column that rises before one that does not."""
 
 from __future__ import annotations
 

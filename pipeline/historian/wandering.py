@@ -54,7 +54,7 @@ class Levels:
 
     @property
     def percent(self) -> float:
-        """What they move over, in % of the span."""
+        """Their movement, in % of the span."""
         return 100 * float(np.ptp(self.level)) / self.span
 
 

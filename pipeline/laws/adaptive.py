@@ -198,7 +198,7 @@ class AdaptiveGains(nn.Module):
             self.slots["square"] = Slot(1, torch.zeros(1, dtype=torch.float64))
 
     def errors(self, p: Named) -> Tensor:
-        """What the gains are multiplied with to give the move: rho (..., 3)."""
+        """Factors of the gains in the move: rho (..., 3)."""
         e, e1, e2 = _error(p), p["e1"], p["e2"]
         return torch.cat([e - e1, (e + e1) / 2, e - 2 * e1 + e2], dim=-1)
 

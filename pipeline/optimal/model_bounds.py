@@ -99,7 +99,7 @@ def _key(test: Scenario) -> str:
 
 
 def _read(kept: Path) -> dict[str, dict[str, float]]:
-    """What was kept; nothing where the file is missing, damaged or of another schema."""
+    """The kept bounds; nothing where the file is missing, damaged or of another schema."""
     try:
         stored: Any = read_json(kept)
     except (OSError, ValueError, PipelineError):

@@ -3,15 +3,14 @@
 Both know the plant exactly, its parameters at every sample included, and its whole state; they
 minimize the metric, absolute or squared errors, and keep the limits.
 
-NMPC sees the set point of now and no later one, and thinks that it stays; likewise the parameters.
-Unforeseen ones it knows of the period before instead, as a perfect observer tells them from what
-that period did: with those of now, a disturbance would cost it nothing.
-The offline optimum takes each set point by itself, from the state where it left the one before,
-with the whole course of parameters and ``Effort.tail`` samples more of the same set point, so that
-it ends at rest. It does not see the next set point either: with that preview a test of steps gets
-a lower bound, which no controller of the tests could use. It is the best of several locally
-best plans, and its figures are those of its own prediction. As it prepares for a change of
-parameters and not for the next set point, it may come to that one less well than NMPC does.
+NMPC sees the set point of now and no later one, and thinks that it stays; likewise the parameters. Unforeseen ones it
+knows of the period before instead, as a perfect observer tells them from what that period did: with those of now, a
+disturbance would cost it nothing. The offline optimum takes each set point by itself, from the state where it left the
+one before, with the whole course of parameters and ``Effort.tail`` samples more of the same set point, so that it ends
+at rest. It does not see the next set point either: with that preview a test of steps gets a lower bound, which no
+controller of the tests could use. It is the best of several locally best plans, and its figures are those of its own
+prediction. It prepares for a change of parameters and not for the next set point, so that it may come to that one less
+well than NMPC does.
 
 A case whose set point follows a recipe is another matter: its controllers may know the course, so
 NMPC sees it as far as it looks ahead, and the offline optimum is one plan for the whole test. The

@@ -38,7 +38,7 @@ class ExportTimes:
 
     @property
     def label(self) -> str:
-        """What stands at the axis."""
+        """Label of the axis."""
         return f"time ({self.zone})" if self.zone else time_axis(np.array([0.0, self.end_s - self.start_s]))[1]
 
     @property

@@ -22,9 +22,9 @@ from serving.manifest import Signal
 
 BASELINE_COLOUR = "#7f7f7f"
 PALETTE = ("#d55e00", "#0072b2", "#cc79a7", "#009e73", "#56b4e9", "#e69f00", "#8c564b", "#332288")
-"""Of the other laws of a case, in their order; told apart also by the colour-blind."""
+"""Colours of the other laws of a case, in their order; told apart also by the colour-blind."""
 SHADES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9")
-"""Of several settings of one law."""
+"""Colours of several settings of one law."""
 OTHER_COLOUR = "#444444"
 SIZE = (8.4, 5.2)  # inches; 100 dots each: MLflow shows pictures in their own size
 STYLE: Any = {

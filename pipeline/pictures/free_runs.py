@@ -16,7 +16,7 @@ from pipeline.pictures.drawing import PALETTE, SIZE, Draw, clear_legend, scale
 from pipeline.pictures.numbers import number
 
 TRAINED = {"one_step_trained": ("one step", "s"), "free_run_trained": ("free runs", "o")}
-"""Of the metrics of a part: what the network was trained on last, and its mark."""
+"""Metrics of a part: the objective of the network's last training, and its mark."""
 NETWORKS = {"nnarx": ("NNARX", PALETTE[0]), "state_space": ("state space", PALETTE[1])}
 
 Figures = dict[str, list[float]]  # one_step_rmse, free_run_rmse, free_run_fit -> one value a data seed

@@ -88,7 +88,7 @@ def step_responses_picture(evidence: Evidence) -> Canvas:
 def _heights(middle: Array, low: Array, high: Array) -> tuple[float, float]:
     """Ends of the axis of a response: its band, as far as that is no wider than the response on either side.
 
-    Of an integrator some likely fits run away in the end, and a band of many powers of ten would hide the response.
+    Some likely fits of an integrator run away in the end, and a band of many powers of ten would hide the response.
     """
     room = float(np.ptp(middle)) or float(np.median(high - low)) or 1.0
     bottom, top = max(low.min(), middle.min() - room), min(high.max(), middle.max() + room)

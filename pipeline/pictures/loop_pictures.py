@@ -344,7 +344,7 @@ def over_orders(values: Array) -> bool:
 def info_label(case: Case, name: str) -> str:
     """An entry of info as an axis's label, with its unit where the name tells what it is.
 
-    What is asked of a signal, or estimated of it, has the signal's unit.
+    A request on a signal, or an estimate of it, has the signal's unit.
     """
     cv, mv = case.plant_class.sp_signals[0], case.plant_class.mv_signals[0]
     known = {
@@ -400,7 +400,7 @@ def cycle_picture(evidence: Evidence, law: str) -> tuple[Canvas, str]:
 def disturbance_picture(evidence: Evidence, scenario: str) -> Canvas:
     """The first sequence of a test that moves a measured disturbance, under the best law and the baseline.
 
-    Of an own plant under all laws: a person chooses among them, and some take the disturbance and some do not.
+    All laws are shown of an own plant: a person chooses among them, and some take the disturbance and some do not.
     """
     laws = dict.fromkeys((evidence.best or "", *(evidence.laws if evidence.case.on_models else ())))
     laws |= {evidence.case.baseline: None}

@@ -23,7 +23,7 @@ ONE_STEP = {
 }
 RECURSIVE_SHADES = ("#cc79a7", "#009e73", "#d55e00")
 BEYOND = 0.5
-"""Of the measured range: how far beyond it a panel reaches; recursive models leave any."""
+"""Share of the measured range that a panel reaches beyond it; recursive models leave any."""
 
 
 def predictions_picture(evidence: Evidence, figure: Figure) -> Canvas:

@@ -59,7 +59,7 @@ def times_of(found: Screened) -> ExportTimes:
 
 
 def _trend(axes: Axes, found: Screened, tag: TagReport, times: ExportTimes) -> set[Reason]:
-    """Of one signal over the grid's rows."""
+    """Trend of one signal over the grid's rows."""
     grid, series = found.grid, found.series[tag.tag]
     at = times.at(grid.time_s)
     values = grid.value[tag.tag]

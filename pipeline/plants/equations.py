@@ -73,7 +73,7 @@ class EquationPlant(Simulator):
         return self
 
     def actual(self, mv: Array) -> Array:
-        """Of a plant that is the relaxation of another: the other's MVs for its own, both (n, n_mv)."""
+        """The MVs of the plant that this one relaxes, from its own, both (n, n_mv)."""
         return mv
 
     # ------------------------------------------------------------------ parameters

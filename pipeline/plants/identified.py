@@ -239,7 +239,7 @@ class IdentifiedPlant(Simulator):
 
 
 def shift_rows(arrays: StateEquation) -> NDArray[np.bool_]:
-    """Which states (n_x,) are copies of another state or an input of the period before."""
+    """The states (n_x,) that are copies of another state or an input of the period before."""
     table = np.concatenate([arrays.a, arrays.b], axis=1)
     copies = (np.count_nonzero(table, axis=1) == 1) & (table.max(axis=1) == 1) & (np.diag(arrays.a) == 0)
     return copies & (arrays.c == 0) & ~arrays.w2.any(axis=1)

@@ -1,4 +1,4 @@
-"""What stands in a person's simulator file, whatever it is written in: the part of a plant that differs by language."""
+"""A person's simulator file, whatever its language: the part of a plant that differs by language."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class PythonFile:
         self.interface = Interface(float(period), pv, mv, dv, stated)
 
     def start(self) -> tuple[Array, Array, Array]:
-        """What the class says; without measured disturbances it may leave them out."""
+        """The start by the class; without measured disturbances it may leave them out."""
         given = self._called("start")
         n = 3 if self.interface.dv else 2
         if not isinstance(given, tuple | list) or len(given) != n:
@@ -62,13 +62,13 @@ class PythonFile:
         return x, mv, self._array("start (dv)", given[2] if n == 3 else [], (len(self.interface.dv),))
 
     def step(self, x: Array, mv: Array, dv: Array, periods: int) -> Array:
-        """As many steps of the class; PlantError names the line of the file where it fails."""
+        """So many steps of the class; PlantError names the line of the file where it fails."""
         for _ in range(periods):
             x = self._array("step", self._called("step", x.copy(), mv, np.array(dv, dtype=np.float64)), x.shape)
         return x
 
     def measure(self, x: Array) -> Array:
-        """What the class says."""
+        """The PVs by the class."""
         return self._array("measure", self._called("measure", x.copy()), (len(self.interface.pv),))
 
     def compared(self, x: Array) -> Array:

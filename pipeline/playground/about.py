@@ -1,4 +1,4 @@
-"""What the page knows of a case: signals, parameters, where it starts, its tests and its controllers."""
+"""The page's knowledge of a case: signals, parameters, where it starts, its tests and its controllers."""
 
 from __future__ import annotations
 

@@ -30,6 +30,6 @@ def levels_of(values: Array) -> tuple[float, ...]:
 
 
 def only_between(name: str, levels: Sequence[float], unit: str = "") -> str:
-    """What an input of so few levels leaves unseen."""
+    """Range that an input of so few levels leaves unseen."""
     values = f"{', '.join(f'{v:.4g}' for v in levels[:-1])} and {levels[-1]:.4g} {unit}".rstrip(" -")
     return f"{name} moves between {len(levels)} values only ({values}): a curve between them cannot be seen"

@@ -38,7 +38,7 @@ class OldController:
 
     @property
     def words(self) -> str:
-        """As a clause."""
+        """The old controller in words, a clause."""
         share = f"{100 * max(self.share, 0.0):.4g} % of its movement over {self.window_rows} rows"
         if not self.believed:
             best = f" (the best explains {share})" if self.rows else ""

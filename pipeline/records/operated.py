@@ -24,7 +24,7 @@ class Operated:
 
     @property
     def words(self) -> str:
-        """As a clause, of the record."""
+        """The operation in words, a clause on the record."""
         rows = f"over {self.rows} rows {'in automatic' if self.automatic else 'of the record, whose mode is not known'}"
         moves = ", ".join(
             f"{mv} moved by {f'{v:.3g} {self.travel_units[mv]}'.rstrip()} a minute" for mv, v in self.travel.items()

@@ -1,4 +1,4 @@
-"""What became of the screening's alarm that a variable drifts, once a model is fitted."""
+"""The screening's alarm that a variable drifts, once a model is fitted."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _alarms(report: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _answer(left: Levels | None, drifts: bool) -> str:
-    """What is left of it: the levels of a free run, None where it has too few rows, and whether gain or level move."""
+    """The rest of it: the levels of a free run, None where it has too few rows, and whether gain or level move."""
     if left is None:
         return f"The fitted model: {FOLLOWED if drifts else 'no drift was found in what its free run leaves'}."
     verdict = FOLLOWED if drifts else LEFT if left.wander else GONE

@@ -39,7 +39,7 @@ MODEL_PICTURES: tuple[tuple[str, Draw, str], ...] = (
         "Gains over each MV, from 10 to 90 % of its values in the record; the other MVs at their medians",
     ),
 )
-"""Of identified models."""
+"""Figures of identified models."""
 
 
 def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""What is asked of the controllers of an own plant, whose tests run on models of its record."""
+"""Requirements on the controllers of an own plant, whose tests run on models of its record."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def own_acceptance(evidence: Evidence) -> list[Statement]:
 
 
 def step_test_to_run(evidence: Evidence) -> str:
-    """What to do where laws were tested and none is shipped: the step test for a better model; else empty.
+    """The remedy where laws were tested and none is shipped: the step test for a better model; else empty.
 
     It is the one that `loopwright new` listed, where it doubted the record. Laws that were not designed, because the
     record does not prove the model, have it among their reasons.

@@ -128,7 +128,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
 
 
 def _caveat(evidence: Evidence, judged: Judged) -> str:
-    """What a person who reads of the best controller must know beside it, as sentences; empty if nothing."""
+    """Warnings for a reader beside the best controller, as sentences; empty without any."""
     missed = [row.what for row in judged.acceptance if row.holds is False]
     found = [f"Not met: {'; '.join(missed)}."] if missed else []
     if evidence.grounds is not None and evidence.grounds.doubt and not evidence.grounds.proven:
@@ -137,7 +137,7 @@ def _caveat(evidence: Evidence, judged: Judged) -> str:
 
 
 def _gate_of(evidence: Evidence) -> str:
-    """What the gate score divides errors by."""
+    """The divisor of errors in the gate score."""
     if evidence.relative_to == "floor":
         return "the error that noise can hide"
     whose = "NMPC" if evidence.relative_to == "nmpc" else law_name(evidence.case.baseline)

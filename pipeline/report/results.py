@@ -115,7 +115,7 @@ def _beside_the_old_loop(standing: Standing) -> str:
 
 
 def _beside_the_best(standing: Standing, shipped: Iterable[LawStanding]) -> list[str]:
-    """What a person who takes the best controller must know: requirements missed, loops that swing."""
+    """Warnings for a person who takes the best controller: requirements missed, loops that swing."""
     lines = [f"not met: {row.what}" for row in standing.requirements if row.holds is False]
     return [*lines, *(f"{law.law} swings to the end in {law.swings}" for law in shipped if law.swings)]
 

@@ -121,7 +121,7 @@ def failed_words(outcome: Outcome) -> str:
 
 
 def drawn_words(draw: Draw, signals: Sequence[Signal]) -> str:
-    """What was drawn, in a line."""
+    """The draws, in a line."""
     words = [f"{name} = {number(value, 4)}" for name, value in draw.parameters.items()]
     words += [f"load {100 * draw.load:.0f} %", f"noise × {draw.noise:.2f}"]
     words += ["one more sample of dead time"] if draw.late else []

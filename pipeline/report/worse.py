@@ -1,4 +1,4 @@
-"""What speaks against a shipped controller: tests in which it is worse than the baseline, or swings to the end."""
+"""Reasons against a shipped controller: tests in which it is worse than the baseline, or swings to the end."""
 
 from __future__ import annotations
 

@@ -1,3 +1,3 @@
-"""What can be wrong with a signal of a served plant."""
+"""Faults of a signal of a served plant."""
 
 FAULTS = ("", "bad", "uncertain", "frozen", "text", "deleted", "int", "nan")  # "": nothing

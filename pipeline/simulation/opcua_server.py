@@ -232,7 +232,7 @@ class PlantServer:
         await self.server.write_attribute_value(self._id(tag), ua.DataValue(variant, code, SourceTimestamp=now))
 
     async def _spoil_alone(self, tag: str) -> None:
-        """Of a node that others write: whether it is there, and of which type."""
+        """Whether a node that others write is there, and its type."""
         fault = await self._fault(tag)
         if tag not in self._gone:
             value = float(await self._value(tag))

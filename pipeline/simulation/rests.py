@@ -101,5 +101,5 @@ def balanced(
 
 
 def inside(values: Array, low: Array, high: Array) -> NDArray[np.bool_]:
-    """Which rows (n,) of values (n, m) lie within [low, high] (m,) in every column."""
+    """The rows (n,) of values (n, m) that lie within [low, high] (m,) in every column."""
     return np.asarray(np.all((values >= low) & (values <= high), axis=-1))

@@ -162,7 +162,7 @@ def timetable(
 
 
 def _set_point(plant: Simulator, event: Event) -> int:
-    """Which of the plant's set points an event moves; ParamsError where it names none of them, or has to name one."""
+    """The plant's set point that an event moves; ParamsError where it names none of them, or has to name one."""
     names = [s.name for s in plant.sp_signals]
     if not event.name and len(names) > 1:
         raise ParamsError(f"plant {plant.name!r} has the set points {', '.join(names)}; name one: {names[0]}=VALUE")

@@ -103,10 +103,10 @@ def _data_of(stage: str, case: str) -> tuple[Path, ...]:
 
 
 def _read_of(stage: str, case: str) -> list[Any]:
-    """What a stage reads of params.yaml beside its own section.
+    """Keys of params.yaml that a stage reads beside its own section.
 
-    Of an own plant its signals; a fit which way the loop that it was run by before acts; a design that loop, which
-    stands beside each controller; a report the case too, and which controllers and models it lists.
+    A stage of an own plant reads its signals; a fit which way the loop that it was run by before acts; a design that
+    loop, which stands beside each controller; a report the case too, and which controllers and models it lists.
     """
     if not case:
         return []

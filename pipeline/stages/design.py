@@ -34,7 +34,7 @@ from pipeline.plants.simulator import Array, Simulator
 from pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder, old_loop_file
 
 REFUSALS = (PipelineError, np.linalg.LinAlgError)
-"""What a law raises that a plant does not suit; any other error is a mistake in the program."""
+"""Errors of a law that a plant does not suit; any other error is a mistake in the program."""
 
 
 def design(name: str) -> None:

@@ -71,7 +71,7 @@ def version_description(
 
 
 def _grounds(validation: Validation | None) -> str:
-    """What figures of tests on identified models rest on; nothing where tests ran on a plant's equations."""
+    """The basis of figures of tests on identified models; nothing where tests ran on a plant's equations."""
     if validation is None or validation.grounds is None:
         return ""
     return f"<p>Every figure was measured {escape(validation.grounds.words)}; none on the plant.</p>"

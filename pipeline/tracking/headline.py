@@ -20,7 +20,7 @@ from pipeline.tracking.stage_results import flat
 MOST = 12
 OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")
 POINTS = 200
-"""Of a curve; a training of thousands of iterations is thinned to these."""
+"""Points of a curve; a training of thousands of iterations is thinned to these."""
 
 Figures = dict[str, float]
 
@@ -98,7 +98,7 @@ def _of_law(tree: Mapping[str, Any], validation: Validation | None) -> dict[str,
 
 
 def _grounds(validation: Validation | None) -> dict[str, Any]:
-    """Of tests on identified models, how well these run free over rows that they never saw [%]."""
+    """Free-run fit [%] of the identified models of the tests over rows that they never saw."""
     grounds = validation.grounds if validation else None
     return {} if grounds is None else {f"models_free_run_fit/{name}": fit for name, fit in grounds.fit.items()}
 

@@ -41,7 +41,7 @@ METRICS = {
 
 
 def _bound(validation: Validation) -> str:
-    """What an error is divided by, in words."""
+    """The divisor of an error, in words."""
     gate = validation.gate
     if gate.relative_to == "nmpc":
         return BOUND[validation.on_models]

@@ -311,7 +311,7 @@ def fetch(
 
 
 def _signer(version: ModelVersion, file: Path, trusted: Sequence[Path] | None) -> str:
-    """Who signed a file that came from the store, in words; SignatureError where none of the keys did."""
+    """Signer of a file that came from the store, in words; SignatureError where none of the keys did."""
     said = signing.words(version.tags)
     if trusted is None:
         return f"signed by {said}, as the store says: verify it with --key PUBLIC" if said else "not signed"

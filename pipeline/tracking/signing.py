@@ -33,7 +33,7 @@ _LONGEST = 36_500  # days
 
 @dataclass(frozen=True, slots=True)
 class Signer:
-    """Who signs what is published, and for how long (None: for ever)."""
+    """Signer of published versions, and for how long (None: for ever)."""
 
     key: PrivateKey
     lasting: timedelta | None
@@ -94,7 +94,7 @@ def present(tags: Mapping[str, str]) -> dict[str, str]:
 
 
 def words(tags: Mapping[str, str]) -> str:
-    """Who signed a version, as its tags say; nothing where nobody did. Only a verification proves it."""
+    """Signer of a version by its tags; nothing where nobody signed it. Only a verification proves it."""
     if FINGERPRINT not in tags:
         return ""
     until = tags.get(UNTIL, FOR_EVER)

@@ -65,7 +65,7 @@ def store() -> Iterator[MlflowClient]:
 
 
 def one_line(error: Exception) -> str:
-    """What mlflow says, without the stack of the HTTP library that it quotes in several lines."""
+    """The message of mlflow, without the stack of the HTTP library that it quotes in several lines."""
     said, _, stack = " ".join(str(error).split()).partition(" failed with exception")
     # It retries an answer of 500 and the like, and tells a server that does not answer from this one only in there.
     own = re.search(r"too many (50\d) error responses", stack)
@@ -73,7 +73,7 @@ def one_line(error: Exception) -> str:
 
 
 def missing_file(error: Exception) -> str:
-    """What to do about a file of a run that the store does not give, in words."""
+    """The remedy for a file of a run that the store does not give, in words."""
     if store_uri().startswith("http"):
         return (
             f"{one_line(error)}; see whether the store of files behind the server runs, and lets the server in "

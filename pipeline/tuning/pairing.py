@@ -1,4 +1,4 @@
-"""Which MV holds which controlled variable when each has a loop of its own."""
+"""Pairing of MVs and controlled variables when each has a loop of its own."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class TunedPairing:
     time_weighted: bool = False  # each error times the periods since its set point moved
 
     def words(self, cvs: Sequence[Signal], mvs: Sequence[Signal]) -> str:
-        """Which MV holds which CV, with the relative gains."""
+        """The MV of each CV, with the relative gains."""
         rows = zip(self.pairs, self.relative_gains, strict=True)
         return ", ".join(f"{cvs[i].name} by {mvs[j].name} ({gain:.2f})" for (i, j), gain in rows)
 
@@ -96,10 +96,11 @@ def gains_of(gain: Array, pairs: Pairs) -> Array:
 def pairings(gain: Array) -> list[tuple[Pairs, Array]]:
     """Pairings of the CVs with as many MVs, the best first, and the relative gains of their MVs (n_cv, n_cv).
 
-    ``gain`` is in shares of the signals' ranges. Of more MVs than CVs those that do most come first, by the column
-    sums of K o (K^+)'; among these, relative gains nearest to 1, sum |Lambda_ij - 1|. Pairings with a negative
-    relative gain or a negative Niederlinski index det K / prod K_ii are left out: with integral action they are
-    unstable, or become so when one loop is opened. Raises LawError where none is left, or there are fewer MVs than CVs.
+    ``gain`` is in shares of the signals' ranges. Where there are more MVs than CVs, those that do most come first, by
+    the column sums of K o (K^+)'; among these, relative gains nearest to 1, sum |Lambda_ij - 1|. Pairings with a
+    negative relative gain or a negative Niederlinski index det K / prod K_ii are left out: with integral action they
+    are unstable, or become so when one loop is opened. Raises LawError where none is left, or there are fewer MVs than
+    CVs.
 
     Source: Skogestad and Postlethwaite, Multivariable Feedback Control, sections 3.4 and 10.6.
     """

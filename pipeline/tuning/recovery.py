@@ -69,7 +69,7 @@ def recover(
 
     A loop has arrived when its controlled variable stays within ``band`` [CV] of the set point for
     ``holding`` samples, and is then no longer simulated: a linear loop's stability says the rest.
-    What has not arrived after ``samples`` has not arrived. The first ``watched`` loops keep their
+    A loop that has not arrived after ``samples`` counts as lost. The first ``watched`` loops keep their
     courses, one state in ``every``. A state that is not finite never arrives.
     """
     n, n_x = starts.x.shape

@@ -1,4 +1,4 @@
-"""What a plant does after a small step of each MV, found by simulation, and the process that resembles it."""
+"""Answers of a plant to a small step of each MV, found by simulation, and the process that resembles it."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class StepResponses:
 
     @property
     def integrates(self) -> NDArray[np.bool_]:
-        """Which CVs (n_cv,) do not come to rest after a step of an MV."""
+        """The CVs (n_cv,) that do not come to rest after a step of an MV."""
         return np.asarray((self.slope != 0).any(axis=1))
 
     @property
@@ -99,7 +99,7 @@ class StepResponses:
     def settling(self) -> int:
         """Samples until the slowest response that comes to rest stays within 5 % of its end; 0 where none does.
 
-        Of one that creeps, until it goes on as it does over its last fifth.
+        For one that creeps, until it goes on as it does over its last fifth.
         """
         n = self.y.shape[-1]
         creeps = np.where(_settled(self.y), 0.0, _slopes(self.y)[-1])

@@ -130,7 +130,7 @@ def imc_pid(process: AllPole | LagWithDeadTime, lambda_s: float) -> PidSettings:
         f = (alpha s + 1)/(lambda s + 1)^2,   alpha = lambda^2 p + 2 lambda
 
     For an unstable plant f(p) = 1, which alpha ensures, makes 1 - f cancel the pole, as internal
-    stability demands: 1 - f = lambda^2 s (s - p)/(lambda s + 1)^2. What remains is a PID exactly:
+    stability demands: 1 - f = lambda^2 s (s - p)/(lambda s + 1)^2. The rest is a PID exactly:
 
         poles p > 0 > -1/tau:   Kc = (1 + alpha/tau)/(b0 lambda^2),  Ti = alpha + tau,  Td = alpha tau/(alpha + tau)
         two stable poles:       Kc = a1/(b0 lambda),  Ti = a1/a0,  Td = 1/a1,  of s^2 + a1 s + a0

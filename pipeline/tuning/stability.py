@@ -119,7 +119,7 @@ def quadratic_contraction(loops: Array) -> float:
 
     sqrt(x'Px) then shrinks by r a period however the loop changes among the M_k: a proof of stability
     for any course of the operating point over them, where r < 1. NaN where there is no such P.
-    What the solver says is not believed: the rate is computed anew from its P.
+    The solver's answer is not believed: the rate is computed anew from its P.
 
     Source: Boyd, El Ghaoui, Feron, Balakrishnan, Linear Matrix Inequalities in System and Control
     Theory, section 5.1; solved by Clarabel through CVXPY.

@@ -25,7 +25,7 @@ SHOWN = 5  # mistakes named one by one
 
 @dataclass(slots=True)
 class Verdict:
-    """What the comparison gave.
+    """Result of the comparison.
 
     ``largest`` is the largest difference, a share of the entry's scale, and ``where`` its place. ``same_bits`` counts
     the steps whose numbers are all equal to the bit, and ``steps`` those that give numbers. ``mistakes`` are what no

@@ -25,7 +25,7 @@ SURE = 0.4  # share of a margin by which a value lies inside or outside it
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """What happens before and at one scan. ``sample`` None: the plant cannot be read.
+    """Events before and at one scan. ``sample`` None: the plant cannot be read.
 
     ``set_mode`` is what the operator sets before it, ``missed`` the periods that passed without a scan before it.
     ``unwritten``: the command of the scan before did not reach the plant.

@@ -1,4 +1,4 @@
-"""What a loop did, scan by scan, in one file: written by a thread of the loop, read by whoever may read the file."""
+"""History of a loop, scan by scan, in one file: written by a thread of the loop, read by whoever may read the file."""
 
 from serving.journal.entries import Event, Scan, columns
 from serving.journal.reader import JournalReader

@@ -1,4 +1,4 @@
-"""What a journal holds: scans, and what happened between them."""
+"""Entries of a journal: scans, and the events between them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Scan:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What somebody changed, or what happened.
+    """A change by somebody, or an event.
 
     With ``alarm`` it begins (``raised``) or ends the alarm of that name; a new one of the same name ends the one
     before. ``about`` is the id of the event that is acknowledged.

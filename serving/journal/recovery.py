@@ -44,7 +44,7 @@ class OpenFiles:
         self.harm()
 
     def harm(self, rows: int = 0) -> Harm | None:
-        """What happened to them since; None: nothing did. OSError where nobody can tell.
+        """Their changes since; None without any. OSError where nobody can tell.
 
         ``rows`` is how many scans and events the journal holds.
         """
@@ -87,7 +87,7 @@ class OpenFiles:
 def sound(base: sqlite3.Connection) -> bool:
     """Whether a journal's tables hang together and every block of scans can be unpacked.
 
-    Of a file that was cut SQLite copies pages of zeros, without an error.
+    SQLite copies pages of zeros from a file that was cut, without an error.
     """
     try:
         if base.execute("pragma quick_check(1)").fetchone() != ("ok",):
@@ -151,7 +151,7 @@ def cleared(files: OpenFiles, *, keep: bool) -> Path | None:
 
 
 def made_again(harm: Harm, lost: int, *, empty: bool, aside: Path | None, unsteady: bool) -> str:
-    """What happened to a journal, in a sentence. ``unsteady``: the numbers of its files are believed no more."""
+    """The fate of a journal, in a sentence. ``unsteady``: the numbers of its files are believed no more."""
     loss = f"{lost} scans and events are lost"
     end = f"it is made again with the rows that are left; {loss}" if lost else "it is made again with all its rows"
     return (

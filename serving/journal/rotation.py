@@ -1,4 +1,4 @@
-"""What goes from a journal that would grow too large: the oldest scans, events and runs."""
+"""Entries that leave a journal that would grow too large: the oldest scans, events and runs."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def shorten_scans(base: sqlite3.Connection, max_bytes: float) -> None:
 def shorten_events(base: sqlite3.Connection, most: int) -> None:
     """Drop the oldest events beyond ``most``.
 
-    Which alarms are active stays; of those that are over and not acknowledged, as many as are half of ``most``.
+    The state of active alarms stays; of those that are over and not acknowledged, as many as are half of ``most``.
     """
     (count,) = base.execute("select count(*) from event").fetchone()
     if count <= most * (1 + SLACK):

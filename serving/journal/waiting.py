@@ -1,4 +1,4 @@
-"""What waits to be written into a journal: a bounded number of scans and events, in the order in which they came."""
+"""Entries that wait for a journal: a bounded number of scans and events, in the order in which they came."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DROPPED = ("scan", "event")  # in this order; a run stays, since scans need it, 
 class Waiting:
     """Beyond ``most`` the oldest are dropped, scans before events; ``lost`` counts them.
 
-    What is taken counts until it is given back or written: a writer that hangs makes nothing grow.
+    An entry that is taken counts until it is given back or written: a writer that hangs makes nothing grow.
     """
 
     def __init__(self) -> None:
@@ -58,12 +58,12 @@ class Waiting:
             return [item for _, item in self._taken]
 
     def written(self) -> None:
-        """What was taken is in the journal."""
+        """The entries that were taken are in the journal."""
         with self._lock:
             self._taken = []
 
     def give_back(self, most: int) -> None:
-        """What was taken waits again."""
+        """The entries that were taken wait again."""
         with self._lock:
             for numbered in reversed(self._taken):
                 self._kinds[numbered[1][0]].appendleft(numbered)

@@ -46,9 +46,9 @@ class Journal:
     ``FLUSH_S`` at most. With ``fsync`` "power loss" each write waits for the disk. Older scans are packed, and beyond
     ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
     takes nothing, or does not answer, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING`` the oldest are
-    ``lost``, scans before events; what a run is stays. That is told once, and once the journal writes again, an alarm
-    in it says how many they were. A file that is deleted, replaced, cut or damaged meanwhile is made again, with the
-    rows that the open one still gives; an alarm says how many went, and they are ``lost`` (see ``recovery``).
+    ``lost``, scans before events; what a run is stays. The loop tells it once, and once the journal writes again, an
+    alarm in it says how many they were. A file that is deleted, replaced, cut or damaged meanwhile is made again, with
+    the rows that the open one still gives; an alarm says how many went, and they are ``lost`` (see ``recovery``).
 
     Raises LoopError for a file that is no journal, and for one that another ``Journal`` writes, also of this process.
     """
@@ -96,7 +96,7 @@ class Journal:
         return self._queue.lost
 
     def begin(self, manifest: Manifest, sha256: str, time_s: float, speed: float = 1.0) -> None:
-        """What follows is of this controller, on a plant that is ``speed`` times as fast as the clock."""
+        """The scans that follow are of this controller, on a plant that is ``speed`` times as fast as the clock."""
         m = manifest
         signals = {name: [s.to_dict() for s in m.signals(name)] for name in ("sp", "pv", "mv", "dv")}
         texts = (json.dumps(columns(m)), json.dumps(signals))

@@ -192,7 +192,7 @@ def run_limit(slack: float, figures: float, f: float = 1.0) -> float:
 
 
 def upper_scatter(freedom: float, z: float) -> float:
-    """What a scatter of so many degrees of freedom is multiplied by for the upper end of its interval.
+    """Factor on a scatter of so many degrees of freedom for the upper end of its interval.
 
     sqrt(nu / chi2(nu)), by Wilson's and Hilferty's chi2 = nu (1 - 2 / (9 nu) - z sqrt(2 / (9 nu)))^3, with the normal
     quantile z of the level.

@@ -33,7 +33,7 @@ class Swing(Remembers):
         self.forget()
 
     def forget(self) -> None:
-        """What follows has nothing to do with what was."""
+        """The samples that follow have nothing to do with those before."""
         self.side, self.since, self.largest = 0, 0, 0.0
         self.intervals: list[int] = []
         self.amplitudes: list[float] = []

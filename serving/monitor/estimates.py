@@ -1,4 +1,4 @@
-"""What a law itself estimates of its model's error: offsets, loads, disturbances in its info."""
+"""A law's own estimates of its model's error: offsets, loads, disturbances in its info."""
 
 from __future__ import annotations
 

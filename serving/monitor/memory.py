@@ -1,4 +1,4 @@
-"""What a detector has learnt, as JSON-ready values and back: a loop that starts again need not learn anew.
+"""The knowledge of a detector, as JSON-ready values and back: a loop that starts again need not learn anew.
 
 The text lies in a file that others may have written, so nothing of it is believed: each value must be of the kind,
 the shape and the range that the detector could have given.

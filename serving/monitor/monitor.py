@@ -44,9 +44,9 @@ NEAR_REST = 0.02  # of a set point's range: a mean error beyond is no rest
 class Monitor:
     """Watches one controller in its loop.
 
-    ``observe`` takes a scan: bounded work and memory, and no content of it raises. The settling time of the
-    validation (the evidence's ``settling``, else ``SETTLE`` scans) says how long a period of rest is. What normal is,
-    it learns from the first periods in AUTO; ``serving.monitor.verdicts`` says what each figure is held against.
+    ``observe`` takes a scan: bounded work and memory, and no content of it raises. The settling time of the validation
+    (the evidence's ``settling``, else ``SETTLE`` scans) says how long a period of rest is. It learns the normal from
+    the first periods in AUTO; ``serving.monitor.verdicts`` says what each figure is held against.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class Monitor:
 
     @property
     def residual(self) -> Foresight | Answers:
-        """What tells the one-step error: the law where it tells what it expects, else a model beside it."""
+        """Source of the one-step error: the law where it gives its expectation, else a model beside it."""
         return self.foresight if self.foresight.told else self.answers
 
     # ------------------------------------------------------------------ a scan
@@ -236,7 +236,7 @@ class Monitor:
         return [replace(v, value=_finite(v.value), limit=_finite(v.limit)) for v in found]
 
     def numbers(self) -> dict[str, float]:
-        """What was measured, for those who draw it over months. It never raises, and every number is finite."""
+        """The figures, for those who draw them over months. It never raises, and every number is finite."""
         try:
             with np.errstate(all="ignore"):
                 return numbers(self)

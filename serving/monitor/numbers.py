@@ -1,4 +1,4 @@
-"""What the monitor has measured, by name."""
+"""The monitor's figures, by name."""
 
 from __future__ import annotations
 

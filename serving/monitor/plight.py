@@ -1,4 +1,4 @@
-"""What is wrong in any loop, whatever is normal in this one: nothing of it has to be learnt first."""
+"""Faults of any loop, whatever is normal in this one: nothing of them has to be learnt first."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Plight:
         self.forget()
 
     def forget(self) -> None:
-        """What follows has nothing to do with what was."""
+        """The samples that follow have nothing to do with those before."""
         n = len(self._span)
         self.stuck, self.end = [0] * n, [0.0] * n  # scans; 1 upper end, -1 lower end
         self.turns, self.move, self._count = [0.0] * n, [0.0] * n, 0

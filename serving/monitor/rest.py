@@ -27,8 +27,8 @@ class RestMap(Remembers):
     """mv_rest = theta' phi(sp), phi piecewise linear over each set point's range, by recursive least squares.
 
     It learns ``learn`` periods of rest and is frozen then, but where it has no data (leverage phi' P phi >= NEAR) it
-    goes on learning. What lies between the map and the MV goes into a chart, averaged over ``pool`` periods; the moves
-    of the MV from one set point to another beside those of the map tell the plant's gain, whatever the load is.
+    goes on learning. The distance between the map and the MV goes into a chart, averaged over ``pool`` periods; the
+    moves of the MV from one set point to another beside those of the map tell the plant's gain, whatever the load is.
     """
 
     KEPT: ClassVar[Kept] = {

@@ -1,4 +1,4 @@
-"""What the monitor says."""
+"""Verdict of the monitor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the figures mean, in plain lines.
+"""The meaning of the figures, in plain lines.
 
 | verdict | held against |
 |---|---|

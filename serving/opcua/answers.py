@@ -1,4 +1,4 @@
-"""What becomes of a request to a server: an answer, a refusal, or none in time."""
+"""The end of a request to a server: an answer, a refusal, or none in time."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def unanswered(error: EndpointError, gone: str) -> bool:
 
 
 async def in_time(doing: Awaitable[T], timeout_s: float) -> T:
-    """What ``doing`` gives. TimeoutError where it takes longer, ConnectionError where it was broken off.
+    """The result of ``doing``. TimeoutError where it takes longer, ConnectionError where it was broken off.
 
     It is a task of its own: asyncua waits by wait_for2, whose own kind of cancellation ``asyncio.timeout`` does not
     take for its own when an answer comes in the moment of its deadline, and would let through to the thread's end.
@@ -84,7 +84,7 @@ def _forgotten(task: asyncio.Future[T]) -> None:
 
 
 def reason(error: BaseException) -> str:
-    """What refused, by OPC UA's own name where it has one."""
+    """The refusal, by OPC UA's own name where it has one."""
     if isinstance(error, ConnectionRefusedError):
         return "nothing listens there; is the server running?"
     code = getattr(error, "code", None)

@@ -63,7 +63,7 @@ class Expiry(NamedTuple):
     cure: str = RENEWAL
 
     def words(self, now: datetime | None = None) -> str:
-        """That it ends within ``ENDS_SOON``, or has ended, in one line; else empty."""
+        """Warning that it ends within ``ENDS_SOON``, or has ended, in one line; else empty."""
         left = self.end - (now or datetime.now(UTC))
         if left > ENDS_SOON:
             return ""
@@ -72,7 +72,7 @@ class Expiry(NamedTuple):
 
 
 def expiries(server: Server) -> list[Expiry]:
-    """Of the loop's certificate and its user's. A file that is none is told when the loop connects."""
+    """Names of the loop's certificate and its user's. A file that is none is told when the loop connects."""
     if server.security == "None":
         return []
     found = []

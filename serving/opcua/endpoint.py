@@ -287,7 +287,7 @@ class OpcUaEndpoint:
             pause = min(pause * GROWTH, LAST_RETRY_S)
 
     async def _leased(self, link: Link, plan: Plan) -> str:
-        """Which lease keeps loops on other machines from writing the same MVs, in words."""
+        """The lease that keeps loops on other machines from writing the same MVs, in words."""
         if plan.lease is None:
             return plan.unwritable or "no lease"
         spaces = await link.namespaces(self.server.connect_s)

@@ -167,7 +167,7 @@ async def _asked(link: Link, server: Server, nodes: list[str]) -> dict[str, _Ask
 
 
 def _namespaces(nodes: Nodes, now: list[str], before: Mapping[int, str]) -> list[Found]:
-    """What each namespace is that ids name by its number: it is another one once the server numbers them otherwise."""
+    """The namespace of each number in the ids: it is another one once the server numbers them otherwise."""
     found = []
     for number, text in sorted(numbers(nodes.ids()).items()):
         uri, name = uri_of(now, number), f"namespace {number}"

@@ -1,4 +1,4 @@
-"""Who writes a plant's MVs, in a node of the plant's server: loops on different machines find each other there."""
+"""The writer of a plant's MVs, in a node of the plant's server: loops on different machines find each other there."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class NodeLease:
         self._text, self._still = "", 0  # of the node, and for how many readings it has stood so
 
     def seen(self, text: str) -> None:
-        """What the node holds at a reading."""
+        """Content of the node at a reading."""
         self._still = self._still + 1 if text == self._text else 0
         self._text = text
         if self.held and _owner(text) != self.owner:

@@ -80,14 +80,14 @@ class Link:
         return link
 
     def _hint(self) -> str:
-        """What to look at where a server does not open a secure channel."""
+        """Things to look at where a server does not open a secure channel."""
         if not self._securing:
             return ""
         pinned = "" if self.server.server_certificate is None else ", and see that server_certificate is its own"
         return f"; let the server trust {self.server.certificate}{pinned}"
 
     def _user_hint(self) -> str:
-        """What to look at where a server does not know its user."""
+        """Things to look at where a server does not know its user."""
         user = self.server.user_certificate
         return "" if user is None else f"; let the server trust {user} as a user's"
 
@@ -281,7 +281,7 @@ class Link:
         self.abort()
 
     def abort(self) -> None:
-        """Break the connection off. What was not sent yet is never sent: an MV that comes late is a wrong one."""
+        """Break the connection off. A write not yet sent is never sent: an MV that comes late is a wrong one."""
         protocol = self.client.uaclient.protocol
         transport = getattr(protocol, "transport", None)
         if transport is not None:

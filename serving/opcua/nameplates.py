@@ -70,7 +70,7 @@ class Nameplates:
 
     ``fault`` says why a measured unit or range is another one now. ``unwritable`` says why that, or the type, of a node
     is which the loop writes: it refuses the MV, not the sample. ``wrong`` has a reason by row. Empty: all is as it was.
-    What is wrong lasts until the node is read with what it had before: an answer that does not come, or tells nothing,
+    A fault lasts until the node is read with what it had before: an answer that does not come, or tells nothing,
     ends nothing.
 
     Parameters
@@ -177,7 +177,7 @@ class Nameplates:
             self._judge(name, what, Fault(f"{name}: {misfit}", what, name) if misfit else "")
 
     def _judge(self, name: str, what: str, why: str) -> None:
-        """What is wrong with a row begins, lasts, or is over (empty)."""
+        """The fault of a row begins, lasts, or is over (empty)."""
         if why:
             self._wrong[name, what] = why
         else:
@@ -185,7 +185,7 @@ class Nameplates:
 
 
 def numbers(ids: Iterable[str]) -> dict[int, str]:
-    """The namespaces that ids name by number, each with the first such id. What is no id is told elsewhere."""
+    """The namespaces that ids name by number, each with the first such id. Texts that are no ids are told elsewhere."""
     found: dict[int, str] = {}
     for text in ids:
         with suppress(EndpointError):
@@ -225,7 +225,7 @@ def renumbered(number: int, text: str, before: str, spaces: Sequence[str]) -> st
 
 
 async def identity(link: Link, nodes: Nodes, started_s: float | None, timeout_s: float) -> Identity:
-    """Which server this is, and which nodes of it the loop writes, however they are spelt.
+    """The identity of the server, and the nodes that the loop writes, however they are spelt.
 
     Two servers may have one name, so a server is known by its name and the moment of its start. Its other namespaces
     are no part of that: it may add some while it runs.

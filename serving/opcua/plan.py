@@ -100,7 +100,7 @@ class Plan:
         self.heartbeat = (node, kind, 2 if kind is ua.VariantType.Boolean else 100)
 
     def variants(self, mv: Array) -> list[tuple[ua.NodeId, ua.Variant]]:
-        """What to write for an MV (n_mv,): raw numbers in the nodes' own types, within the range."""
+        """Values to write for an MV (n_mv,): raw numbers in the nodes' own types, within the range."""
         rows = []
         signals = zip(self.written, self.mv_points, self.manifest.mv, mv.tolist(), strict=True)
         for (node, kind), point, s, value in signals:
@@ -110,7 +110,7 @@ class Plan:
         return rows
 
     def hand_back(self) -> tuple[ua.NodeId, ua.Variant]:
-        """What to write to hand the plant back."""
+        """Values to write to hand the plant back."""
         assert self._hand_back is not None
         assert self.nodes.hand_back is not None
         (node, kind), value = self._hand_back, self.nodes.hand_back.value

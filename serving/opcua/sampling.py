@@ -1,4 +1,4 @@
-"""What the answers of one reading say: values in engineering units, and the first thing that is wrong with them."""
+"""The answers of one reading: values in engineering units, and the first thing that is wrong with them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Values:
-    """What one reading brought. ``quality`` has a status for each PV, then each MV, then each DV that is read."""
+    """Result of one reading. ``quality`` has a status for each PV, then each MV, then each DV that is read."""
 
     arrived_s: float  # on the endpoint's clock
     pv: Array  # shape: (n_pv,)
@@ -126,6 +126,6 @@ class Sampling:
 
 
 def _given(name: str, text: str) -> str:
-    """What a value is instead of a number; of NaN and infinity also who gives it."""
+    """The kind of a value that is no number; of NaN and infinity also who gives it."""
     by = "read-back" if name.startswith("MV ") else "sensor"
     return f"{text}: the {by} gives no number" if text in NO_NUMBERS else text

@@ -1,4 +1,4 @@
-"""What an endpoint must be told: the server, how to speak to it, and the node of every signal."""
+"""Settings of an endpoint: the server, how to speak to it, and the node of every signal."""
 
 from __future__ import annotations
 

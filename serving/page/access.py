@@ -1,4 +1,4 @@
-"""Who may see the page, and what a browser may do with it."""
+"""Access to the page, and the rights of a browser."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Access:
     """Answers only who asks for one of ``hosts``, and lets nothing but this page's own scripts change anything.
 
     A name that an attacker's own DNS points here is no name of this page (Host); a form or a script of another site
-    says where it comes from (Origin, Sec-Fetch-Site). Of other sites only a link to the page itself is followed.
+    says where it comes from (Origin, Sec-Fetch-Site). From other sites only a link to the page itself is followed.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], scheme: str) -> None:

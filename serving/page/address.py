@@ -1,4 +1,4 @@
-"""What a page needs of its machine: a port to listen at, and a certificate with its key."""
+"""Needs of a page on its machine: a port to listen at, and a certificate with its key."""
 
 from __future__ import annotations
 

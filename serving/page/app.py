@@ -38,7 +38,7 @@ TRENDS_LATER_S = 2  # after which a trend beyond them may be asked for again
 
 
 class PageApp:
-    """What the page asks for, from the journal and from the loop itself (``ask``)."""
+    """Answers to the page, from the journal and from the loop itself (``ask``)."""
 
     def __init__(self, journal: Path, ask: Ask, token: str, tell: Callable[[str], None] = lambda _: None) -> None:
         self.journal, self.ask, self.token, self.tell = journal, ask, token, tell
@@ -74,7 +74,7 @@ class PageApp:
         return FileResponse(STATIC / "index.html", media_type="text/html; charset=utf-8")
 
     async def about(self, _: Request) -> Response:
-        """What the loop is."""
+        """Description of the loop."""
         return Response(await self._described(), media_type="application/json")
 
     async def _describe(self) -> str:
@@ -133,7 +133,7 @@ class PageApp:
             return json.dumps(trend(reader, begin, end, points), allow_nan=False)
 
     async def events(self, request: Request) -> Response:
-        """What happened, newest first."""
+        """Events, newest first."""
         limit = _number(request, "limit", ENTRIES)
         if not 1 <= limit <= MOST_POINTS:
             raise HTTPException(400, f"limit must lie in 1 .. {MOST_POINTS}")
@@ -145,7 +145,7 @@ class PageApp:
         return JSONResponse({"events": await asyncio.to_thread(read)})
 
     async def stream(self, request: Request) -> Response:
-        """What is new, as server-sent events."""
+        """News, as server-sent events."""
         if request.method == "HEAD":
             return Response(media_type="text/event-stream")
         if self.live.full:

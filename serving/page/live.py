@@ -1,4 +1,4 @@
-"""What is new in a loop, sent to every open page."""
+"""News of a loop, sent to every open page."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ENTRIES = 200
 class Live:
     """Reads the journal and asks the loop for all pages together, as long as there is one.
 
-    What fails meanwhile is counted (``failed``), told when it is another thing than before, and tried again.
+    A failure meanwhile is counted (``failed``), told when it is another thing than before, and tried again.
     """
 
     def __init__(self, journal: Path, ask: Ask, tell: Callable[[str], None] = lambda _: None) -> None:

@@ -60,7 +60,7 @@ class Page:
             return False
 
     def hosts(self, port: int) -> list[str]:
-        """What a browser's Host header may say: at the port of its scheme it names none."""
+        """Allowed Host headers of a browser: at the port of its scheme it names none."""
         host, _ = self.address
         shown = f"[{host}]" if ":" in host else host
         names = list(dict.fromkeys((shown.lower(), "localhost", "127.0.0.1", "[::1]")))

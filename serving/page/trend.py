@@ -117,12 +117,12 @@ class Modes:
 
 
 def _graver(one: str, other: str) -> str:
-    """Which of two modes is shown where there is room for one."""
+    """The one of two modes that is shown where there is room for one."""
     return max(one, other, key=lambda mode: MODES.index(mode) if mode in MODES else 0)
 
 
 def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> dict[str, Any]:
-    """What is drawn from ``begin_s`` to ``end_s``: at most 2 ``points`` rows, and the changes of mode, thinned alike.
+    """The trend from ``begin_s`` to ``end_s``: at most 2 ``points`` rows, and the changes of mode, thinned alike.
 
     The mode is empty from the last scan before a gap to the first one after it. Times ascend: where the clock was set
     back, what came before and after it lies one over the other.

@@ -25,7 +25,7 @@ _SHOWN = 60
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """What was signed, its signature, and by which key the bundle says so (empty: it does not say)."""
+    """The signed statement, its signature, and the key that the bundle names (empty: none)."""
 
     payload: bytes
     signature: bytes

@@ -85,7 +85,7 @@ class PublicKey:
 
 @dataclass(frozen=True, slots=True)
 class PrivateKey:
-    """What signs. Its text and its repr hold nothing of the key."""
+    """A key that signs. Its text and its repr hold nothing of the key."""
 
     name: str
     _key: _Private
@@ -95,7 +95,7 @@ class PrivateKey:
 
     @property
     def public(self) -> PublicKey:
-        """What verifies."""
+        """A key that verifies."""
         return PublicKey(self.name, self._key.public_key())
 
     def sign(self, data: bytes) -> bytes:

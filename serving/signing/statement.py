@@ -1,4 +1,4 @@
-"""What is signed: an in-toto statement with the predicate of OpenSSF Model Signing 1.0.
+"""The signed statement: an in-toto statement with the predicate of OpenSSF Model Signing 1.0.
 
     {"_type": "https://in-toto.io/Statement/v1",
      "subject": [{"name": NAME, "digest": {"sha256": ROOT}}],
@@ -7,7 +7,7 @@
                    "resources": [{"name": FILE, "algorithm": "sha256", "digest": HEX}, ...],
                    "loopwright": {"signed": TIME, "expires": TIME}}}
 
-ROOT is the SHA-256 of the resources' digests, as bytes, one after the other. That format knows no expiry. Its
+ROOT is the SHA-256 of the resources' digests, as bytes, one after the other. The format knows no expiry. Its
 verifiers ignore further entries of the predicate, so ours stand there: signed as the rest is, and read by us alone.
 """
 

@@ -27,7 +27,7 @@ Trusted: TypeAlias = Sequence["str | PathLike[str] | PublicKey"]
 
 @dataclass(frozen=True, slots=True)
 class Signed:
-    """Who signed a file: the key, its holder's name here, when, until when, and the file's SHA-256."""
+    """Signer of a file: the key, its holder's name here, when, until when, and the file's SHA-256."""
 
     name: str
     fingerprint: str
@@ -51,7 +51,7 @@ class Signed:
         return f"{self.name} (key {self.fingerprint[:16]}){on}{until}"
 
     def ending(self, now: datetime | None = None) -> str:
-        """That the signature ends within ``ENDS_SOON``, or has ended, in one line; else empty."""
+        """Warning that the signature ends within ``ENDS_SOON``, or has ended, in one line; else empty."""
         left = None if self.expires is None else self.expires - (now or datetime.now(UTC))
         if left is None or left > ENDS_SOON:
             return ""
@@ -83,7 +83,7 @@ def verified(
     now: datetime | None = None,
     signature: str | PathLike[str] | None = None,
 ) -> Signed:
-    """Who signed a controller's file.
+    """Signer of a controller's file.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ def begun_at(mv: Array, signals: tuple[Signal, ...]) -> list[float] | None:
 
 
 def another_before(journal: Path, controller: Controller) -> str:
-    """That the last loop of a journal ended with another controller, in one line; else empty."""
+    """Notice that the last loop of a journal ended with another controller, in one line; else empty."""
     runs: list[dict[str, object]] = []
     with suppress(LoopError, sqlite3.Error), closing(JournalReader(journal)) as reader:
         runs = reader.runs()

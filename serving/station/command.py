@@ -134,7 +134,7 @@ def _ask(options: argparse.Namespace) -> int:
 
 
 def _user() -> str:
-    """Who asks; a user without a name, as in a container, by number."""
+    """The person who asks; a user without a name, as in a container, by number."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):
@@ -266,7 +266,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _misfits(settings: Settings, manifest: Manifest) -> list[str]:
-    """What of ``loop check`` is wrong for good: another unit, a node that is not there. None while nobody answers."""
+    """Faults of ``loop check`` that are for good: another unit, a node that is not there. None while nobody answers."""
     from serving.opcua.inspection import inspected
     from serving.station.beginning import namespaces_before
     from serving.station.rehearsal import require_free
@@ -280,7 +280,7 @@ def _misfits(settings: Settings, manifest: Manifest) -> list[str]:
 
 
 def _left(manifest: Manifest, last: Command) -> str:
-    """What the plant is left with."""
+    """The state in which the plant is left."""
     if not last.writes:
         return f"ended in {last.mode}: this loop does not write, and the plant keeps what others set"
     stay = ", ".join(f"{s.name} at {v:.5g} {s.unit}" for s, v in zip(manifest.mv, last.mv.tolist(), strict=True))
@@ -342,5 +342,5 @@ def _events(options: argparse.Namespace) -> int:
 
 
 def _quiet() -> None:
-    """What the library would say of a connection that is lost, the loop says itself."""
+    """The loop itself reports a lost connection, in place of the library."""
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)

@@ -110,8 +110,8 @@ class _Row:
 def tag_table(journal: Path, out: Path) -> None:
     """Write the tags of the exported file: roles, names and units as the last controller had them.
 
-    A range is the widest of all runs, so that no reading of an earlier controller counts as impossible. What the last
-    controller may command of an MV stands beside it where that is less.
+    A range is the widest of all runs, so that no reading of an earlier controller counts as impossible. The range that
+    the last controller may command of an MV is beside it where that is less.
     """
     with closing(JournalReader(journal)) as reader:
         runs = reader.runs()

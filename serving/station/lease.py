@@ -27,7 +27,8 @@ class Lease:
     node that another loop has locked meanwhile is lost: ``lost`` says so, until ``tend`` has it back.
 
     The first locks are of the nodes as they are spelt. Once the server is known, ``claim`` locks them by what they are,
-    since a host and an id can be written in many ways. Who writes claims; ``disclaim`` leaves them to the others.
+    since a host and an id can be written in many ways. The loop that writes claims; ``disclaim`` leaves them to the
+    others.
 
     Raises LoopError that names the process which has one, OSError where a lock cannot be opened.
     """

@@ -59,7 +59,7 @@ class Locks:
             self._tell()
 
     def untended(self, trouble: str) -> None:
-        """What keeps the loop's files from being looked after; empty: nothing does any more."""
+        """The obstacle to looking after the loop's files; empty without one."""
         self._untended = trouble
         self._tell()
 

@@ -1,4 +1,4 @@
-"""What a loop writes down of each scan: the numbers, and what began or ended with it."""
+"""Record of each scan of a loop: the numbers, and what began or ended with it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Recorder:
                 self.note(event.kind, "loop", "over: the loop begins anew", alarm=event.alarm)
 
     def begin(self, controller: Controller) -> None:
-        """What follows is of this controller."""
+        """The scans that follow are of this controller."""
         self._controller = controller
         self.journal.begin(controller.manifest, controller.sha256, time.time(), self._speed)
 

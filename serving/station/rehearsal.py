@@ -1,4 +1,4 @@
-"""What would stop a loop on its own machine, before it is connected: its parts are made, and let go."""
+"""Obstacles to a loop on its own machine, before it is connected: its parts are made, and let go."""
 
 from __future__ import annotations
 

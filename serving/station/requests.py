@@ -1,4 +1,4 @@
-"""What somebody asks a running loop for, checked before it comes near the loop."""
+"""Requests to a running loop, checked before it comes near the loop."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TRIAL, LONGEST_TRIAL = 60, 1_000_000  # scans
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What somebody wants changed: ``act`` does it, ``what`` says it, ``done`` is told how it went (empty: well)."""
+    """A change that somebody wants: ``act`` does it, ``what`` says it, ``done`` is told how it went (empty: well)."""
 
     act: Callable[[ControlLoop], None]
     what: str
@@ -39,7 +39,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What is wanted, by whom and why."""
+    """The request, by whom and why."""
 
     do: str
     value: Any
@@ -99,7 +99,7 @@ def _mode(request: Request, loop: ControlLoop, _: Opened) -> Change:
 
 
 def require_proven(loop: ControlLoop, accepted: bool) -> str:
-    """What is not proven of the controllers that write in AUTO, the one on trial included; empty if nothing.
+    """Doubts on the controllers that write in AUTO, the one on trial included; empty without any.
 
     LoopError where something is not, and nobody accepts it.
     """

@@ -65,7 +65,7 @@ class Guards:
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """What follows a fault.
+    """Action after a fault.
 
     ``recover_after`` good samples lead back to AUTO; 0: only the operator does. A fault of more than ``max_s`` is for
     ``then``: ``stay`` with the last MV, go to the ``safe`` MVs at a ``rate`` [mv units/s], or ``hand back`` to the
@@ -85,7 +85,7 @@ class Hold:
             raise LoopError('safe MVs go with then = "safe", and it with them')
 
     def fallback(self, mv: tuple[Signal, ...]) -> Fallback | None:
-        """What the loop is to do; LoopError where an MV has no safe value or rate, or one outside its range."""
+        """The task of the loop; LoopError where an MV has no safe value or rate, or one outside its range."""
         if self.then == "stay":
             return None
         if self.then == "hand back":

@@ -131,7 +131,7 @@ class Station:
 
     @property
     def manifest(self) -> Manifest:
-        """Of the controller that the loop began with: the signals that are read, whichever controller takes over."""
+        """Manifest of the first controller: the signals that are read, whichever controller takes over."""
         return self.controller.manifest
 
     def ending(self) -> list[str]:
@@ -326,7 +326,7 @@ class Station:
         return tried(charge.path.parent / file, sha256, self.trusted)
 
     def answer(self, tree: Any) -> Answer:
-        """What a request gets, from any thread: a view, or the change once a scan has carried it out."""
+        """The answer to a request, from any thread: a view, or the change once a scan has carried it out."""
         if isinstance(tree, dict) and tree.get("do") in {"state", "about", "picture"}:
             return self._view(str(tree["do"]))
         request = Request.read(tree)

@@ -26,7 +26,7 @@ PICTURES = ("{stem}.png", "figures/closed_loop_{stem}.png")
 
 
 def about(station: Station) -> View:
-    """What the loop is: its controller, its signals, the controllers that could take its place."""
+    """Description of the loop: its controller, its signals, the controllers that could take its place."""
     controller = station.loop.controller if station.loop is not None else station.controller
     m = controller.manifest
     groups = {"sp": m.sp, "pv": m.pv, "mv": m.mv, "dv": m.dv}

@@ -1,4 +1,4 @@
-"""What the plant's own operator asks for by the nodes of its set points and its mode."""
+"""Requests of the plant's own operator by the nodes of its set points and its mode."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ MODE = "mode"
 class Wishes:
     """A value that has changed is a wish.
 
-    The set points that stand there when the loop begins are wishes, too; the mode is none. What a server shows that has
-    started anew are its defaults: nobody asked for them, and they are no wish until they change.
+    The set points that stand there when the loop begins are wishes, too; the mode is none. The values of a server that
+    has started anew are its defaults: nobody asked for them, and they are no wish until they change.
     """
 
     def __init__(self) -> None:

@@ -29,9 +29,8 @@ class BatchReactor(EquationPlant):
     States C_A, C_B [kmol/m3] and T [deg C], the process variable; u in 0..1 runs from full cooling
     to full heating. A batch starts with A alone at 25 deg C.
 
-    A batch has no steady state with A left. What stands for one where a steady state is asked for
-    (tuning a PID, starting a test at a temperature) is the reactor with A and B used up:
-    u = -(a1 + a2 T) / (b1 + b2 T).
+    A batch has no steady state with A left. Where a steady state is asked for (tuning a PID, starting a test at a
+    temperature), the reactor with A and B used up takes its place: u = -(a1 + a2 T) / (b1 + b2 T).
 
     Source: [chen2004, eqs. 37-41 and Table 4] (E in kJ/kmol).
     """

@@ -185,7 +185,7 @@ def _recovered(evidence: Evidence) -> Outcome:
 
 
 def _gone_out(evidence: Evidence) -> Outcome:
-    """That the state in which the reaction has gone out is shown as what it is: no law of this case ends it."""
+    """The state in which the reaction has gone out is shown: no law of this case ends it."""
     states = _analyses(evidence, "states_of_no_return", *BOTH)
     plant, mv = evidence.case.equations, evidence.case.plant_class.mv_signals[0]
     because = (
@@ -196,7 +196,7 @@ def _gone_out(evidence: Evidence) -> Outcome:
 
 
 def _in_order(evidence: Evidence) -> Outcome:
-    """That one knob is ahead of PID 1, and that none of PIDs 2 to 5 holds the whole range as PID 1 does."""
+    """One knob is ahead of PID 1, and none of PIDs 2 to 5 holds the whole range as PID 1 does."""
     knob, first, *others = (
         [evidence.measured(curve, test, "iae") for test in TESTS[:3]] for curve in (AUTO, PID_1, *ALONE)
     )

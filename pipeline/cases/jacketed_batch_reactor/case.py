@@ -38,13 +38,12 @@ ROUNDING = 1e-9  # [deg C]
 class JacketedBatchReactorCase(Case):
     """[karer, section 5], at a period of 10 s, which its core's time constant fits.
 
-    The printed test runs on the printed fuzzy model (``same_model``). What the paper leaves open is
-    tested beside it: the same recipe on the reactor that is behind the model (``profile``), with
-    other feed temperatures, a greater heat loss and a fouled jacket; on ten printed models each of
-    whose jacket coefficients is off by up to 10 or 20 % (of a1 its distance to 1: of a1 itself, most
-    would not be stable; the core's two stay as they are); and random recipes. Each with measurement
-    noise, too. The shipped laws have an identified model (``tied``) there, too, which is off on every
-    printed model.
+    The printed test runs on the printed fuzzy model (``same_model``). Further tests cover the questions that the paper
+    leaves open: the same recipe on the reactor that is behind the model (``profile``), with other feed temperatures, a
+    greater heat loss and a fouled jacket; on ten printed models each of whose jacket coefficients is off by up to 10 or
+    20 % (of a1 its distance to 1: of a1 itself, most would not be stable; the core's two stay as they are); and random
+    recipes. Each with measurement noise, too. The shipped laws have an identified model (``tied``) there, too, which is
+    off on every printed model.
     """
 
     held_out_seeds: tuple[int, ...] = (9001, 9002, 9003, 9004, 9005)

@@ -1,4 +1,4 @@
-"""What is drawn for one loop: the plant, the test, the noise and the actuator's fault."""
+"""The draw of one loop: the plant, the test, the noise and the actuator's fault."""
 
 from __future__ import annotations
 

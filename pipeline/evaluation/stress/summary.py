@@ -1,4 +1,4 @@
-"""What the loops of a stress test say together: spreads, shares, the worst, and what makes the error grow."""
+"""The loops of a stress test together: spreads, shares, the worst, and what makes the error grow."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Summary:
     def relative(self) -> Array:
         """The error of each loop in the case's metric over the median of its test, (n,).
 
-        Of a broken loop it is infinite. Where most loops of a test broke, its median is that of the others.
+        It is infinite where a loop broke. Where most loops of a test broke, its median is that of the others.
         """
         errors, found = figures_of(self.outcomes, self.case.metric), np.empty(len(self.outcomes))
         for places in self.tests.values():

@@ -14,15 +14,15 @@ from pipeline.export.fusion.postponing import postpone
 from pipeline.export.fusion.reading import Reading
 
 LEAST_SHARE = 0.002
-"""Of its price a graph must save so much; else it stays as it is."""
+"""A graph must save this share of its price; else it stays as it is."""
 
 
 def fused(model: onnx.ModelProto) -> onnx.ModelProto:
     """The same function with fewer operators; the model itself where nothing is gained.
 
-    What is affine in the inputs and in the results of nonlinear operators is computed by few
-    products, never by one that is dearer than what it replaces. Equal to the given graph but for
-    the rounding. The graph must have static shapes and operators that a controller may have.
+    Values that are affine in the inputs and in the results of nonlinear operators are computed by few products, never
+    by one that is dearer than what it replaces. Equal to the given graph but for the rounding. The graph must have
+    static shapes and operators that a controller may have.
     """
     candidates = []
     together = joined(model)

@@ -1,4 +1,4 @@
-"""Which form each value gets: the cheapest of some uniform preferences, then one by one while that pays."""
+"""The form of each value: the cheapest of some uniform preferences, then one by one while that pays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which operators a graph needs under some choice of forms, and what they cost: kept up to date change by change."""
+"""Operators that a graph needs under some choice of forms, and their price: kept up to date change by change."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class Member(Item):
 
 
 class Pool(Item):
-    """What is computed together for all its members that are needed: the price depends on them."""
+    """A value computed together for all its members that are needed: the price depends on them."""
 
     __slots__ = ("_known", "members")
 
@@ -97,7 +97,7 @@ class Pool(Item):
         self._known: dict[frozenset[int], tuple[float, list[Item]]] = {}
 
     def settled(self) -> tuple[float, list[Item]]:
-        """What ``settle`` says; the search comes back to the same members again and again."""
+        """The answer of ``settle``; the search comes back to the same members again and again."""
         members = frozenset(map(id, self.members))
         found = self._known.get(members)
         if found is None:
@@ -111,7 +111,7 @@ class Pool(Item):
 
 @dataclass(slots=True)
 class Account:
-    """What is needed, and its price [ns]."""
+    """The operators that are needed, and their price [ns]."""
 
     total: float = 0.0
 

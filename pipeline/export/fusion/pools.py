@@ -1,4 +1,4 @@
-"""What is computed for several values at once."""
+"""Products computed for several values at once."""
 
 from __future__ import annotations
 

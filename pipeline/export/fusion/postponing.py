@@ -46,7 +46,7 @@ def _first_users(items: Items) -> dict[int, int]:
 
 
 def _possible(item: Item) -> Iterable[Item]:
-    """What an item is computed from, whatever is chosen; of a product only its pieces, whose blocks are known."""
+    """The inputs of an item, whatever is chosen; of a product only its pieces, whose blocks are known."""
     if isinstance(item, Choice):
         return item.forms.values()
     if isinstance(item, Member) and isinstance(item.pool, Selection):

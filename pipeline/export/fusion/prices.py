@@ -1,4 +1,4 @@
-"""What an operator costs in onnxruntime on one core [ns]: measured on rows of equal operators, rounded."""
+"""Price of an operator in onnxruntime on one core [ns]: measured on rows of equal operators, rounded."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LARGE_FROM = 4_000  # multiply-adds
 
 
 def price(op: str, inputs: Sequence[Shape], outputs: Sequence[Shape]) -> float:
-    """Of one operator. Shapes of its inputs that are no settings (axes, lengths) come first."""
+    """Price of one operator. Shapes of its inputs that are no settings (axes, lengths) come first."""
     n = sum(prod(s) for s in outputs)
     if op in ("MatMul", "Gemm"):
         return product(inputs[0], inputs[1], outputs[0])
@@ -36,7 +36,7 @@ def price(op: str, inputs: Sequence[Shape], outputs: Sequence[Shape]) -> float:
 
 
 def product(left: Shape, right: Shape, out: Shape) -> float:
-    """Of a MatMul. A single column costs as much as eight."""
+    """Price of a MatMul. A single column costs as much as eight."""
     columns = right[-1] if len(right) > 1 else 1
     inner = left[-1]
     rows = max(1, prod(out) // max(columns, 1))

@@ -1,4 +1,4 @@
-"""What a graph is read as: blocks, and affine functions of them."""
+"""Reading of a graph: blocks, and affine functions of them."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Origin:
 
 
 Operand: TypeAlias = Value | Array | None
-"""Of an operator: a value, a constant, or left out."""
+"""Input of an operator: a value, a constant, or left out."""
 
 
 def picked(value: Value) -> tuple[int, Array] | None:

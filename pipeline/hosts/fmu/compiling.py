@@ -52,7 +52,7 @@ class Toolchain:
 
 
 def toolchain(onnxruntime: Path | None = None) -> Toolchain:
-    """What this machine has; ``onnxruntime``: a folder with a header of its own in place of the one that is shipped.
+    """The tools of this machine; ``onnxruntime``: a folder with a header of its own in place of the shipped one.
 
     Raises HostError, or PlantError for fmpy, naming what is missing.
     """

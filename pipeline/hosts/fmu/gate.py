@@ -46,7 +46,7 @@ def check(controller: Controller, fmu: Path, folder: Path) -> int:
 
 
 def problems(fmu: Path) -> list[str]:
-    """What fmpy finds wrong in an FMU: its XML against FMI's schema, names, units, the structure of its outputs."""
+    """Faults of an FMU by fmpy: its XML against FMI's schema, names, units, the structure of its outputs."""
     fmpy()
     validation = importlib.import_module("fmpy.validation")
     return list(validation.validate_fmu(str(fmu)))

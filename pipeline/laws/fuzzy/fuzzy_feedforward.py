@@ -60,7 +60,7 @@ class FuzzyFeedforwardPi(FuzzyLaw):
         R(k+2)  = c_t R + c_w (T_w,adj - u(k))
 
     with h the period and g the share of the reference's distance to the set point that is to be made
-    up in a sample. What the modes reach of T_w,des (``FuzzyLaw``) counts from the measured core and
+    up in a sample. The part of T_w,des that the modes reach (``FuzzyLaw``) counts from the measured core and
     the model's jacket, which follows the applied MVs and is corrected by the share k_jacket of its
     distance to the measured one: a model whose throttle does too little or too much would ring with
     the measured jacket alone. Where the jacket gives all that was asked for, R approaches the set
@@ -77,7 +77,7 @@ class FuzzyFeedforwardPi(FuzzyLaw):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(FuzzyParams):
-        """As FuzzyParams, and the numbers of the class.
+        """Parameters of FuzzyParams, and the numbers of the class.
 
         ``kc`` [degC of the jacket per degC of the core] and ``ti_s`` [s] are the PI controller's,
         ``approach`` (g) and ``k_jacket`` the shares above, in 0..1 [-], g above 0.

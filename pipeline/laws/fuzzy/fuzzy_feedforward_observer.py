@@ -46,7 +46,7 @@ class FuzzyFeedforwardObserver(FuzzyLaw):
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(FuzzyParams):
-        """As FuzzyParams, and the shares of the observers and of the approach, in 0..1 [-], g above 0.
+        """Parameters of FuzzyParams, and the shares of the observers and of the approach, in 0..1 [-], g above 0.
 
         ``k_jacket``, ``k_core`` are the shares of an innovation that correct an estimate, ``l_jacket``,
         ``l_core`` those that go into its offset; ``core_gain`` (c) is the share of the core's distance to

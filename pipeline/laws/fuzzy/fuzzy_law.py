@@ -65,8 +65,8 @@ class FuzzyLaw(ControlLaw):
 
         |adj_d - T_w,des| + switch_penalty [d is not the present mode]
 
-    is taken, the present one where two are equal, and with it k_M = (adj_d - base_d) / gain_d. What
-    it reaches, and the core after it, are the adjusted reference, which the law goes on from.
+    is taken, the present one where two are equal, and with it k_M = (adj_d - base_d) / gain_d. The jacket's reach, and
+    the core after it, are the adjusted reference, from which the law goes on.
 
     Source: [karer, eqs. 13-23 and section 4.2]; the switching cost, and the
     two samples, which the printed cascade needs, are ours.

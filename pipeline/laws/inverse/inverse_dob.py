@@ -160,7 +160,7 @@ class ObserverLaw(ControlLaw):
         return OWN_CHOICE if set(given) & {"identified", *cls.parts} == {"identified"} else tuple(cls.parts)
 
     def analysis(self, plant: Simulator | None) -> Analysis:
-        """What the law chose itself; empty where its parts were given."""
+        """The law's own choices; empty where its parts were given."""
         return Analysis() if self.choice is None else self.choice.analysis(self.signals)
 
     @abstractmethod
@@ -222,7 +222,7 @@ class InverseDob(ObserverLaw):
         self.inverse = inverse
 
     def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
-        """As in ObserverLaw."""
+        """The same as in ObserverLaw."""
         v: Tensor = self.inverse(torch.cat([pv, w], dim=-1))
         return v
 
@@ -253,7 +253,7 @@ class ForwardDob(ObserverLaw):
         hold_numbers(self, flat=1e-12 * (signals.sp[0].high - signals.sp[0].low))
 
     def invert(self, pv: Tensor, w: Tensor, g: Tensor) -> Tensor:
-        """As in ObserverLaw."""
+        """The same as in ObserverLaw."""
         start = self.low + self.part * self._before(w, g)
         g = candidates(self.model, pv, start + self.cuts)
         inside = self._before(w, g)

@@ -1,4 +1,4 @@
-"""What the observer laws choose from an identified model: the horizon, and the PV that tells of disturbances."""
+"""Choices of the observer laws from an identified model: the horizon, and the PV that tells of disturbances."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class GaussNewtonPid(NnarxPid):
 
     @dataclass(frozen=True, slots=True)
     class Params(NnarxParams):
-        """As NnarxParams; ``relinearize`` is the number of linearizations, 1 or more."""
+        """Parameters of NnarxParams; ``relinearize`` is the number of linearizations, 1 or more."""
 
         relinearize: int = 5
 

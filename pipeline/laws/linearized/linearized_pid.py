@@ -41,7 +41,7 @@ class LinearizedPid(NnarxPid):
 
     @dataclass(frozen=True, slots=True)
     class Params(NnarxParams):
-        """As NnarxParams, and the penalty that ``adaptive`` puts in the place of ``penalty``.
+        """Parameters of NnarxParams, and the penalty that ``adaptive`` puts in the place of ``penalty``.
 
         ``penalty_start`` and ``penalty_low`` [pv^2]: its first and its least value, None as ``penalty``;
         ``eps_high`` and ``eps_low`` [pv]: linearization errors above which it doubles and below which it

@@ -47,7 +47,7 @@ class PID(ControlLaw):
     move and the set point then returns to the process variable, the law does not subtract a
     proportional action that the actuator never received (``never_given``).
 
-    Of several loops each has its own numbers; of the two pairings with relative gains nearest to 1 (``pairings``) the
+    Each of several loops has its own numbers; of the two pairings with relative gains nearest to 1 (``pairings``) the
     pairs are those of the smaller error in closed loop, unless they are given. An MV that no loop moves stays where it
     is.
 

@@ -32,7 +32,7 @@ HOLDS = (60, 400)  # least and most
 class Tuned:
     """Settings of one loop, or of the loop of each pair; of several loops also the pairings that were tuned.
 
-    Of ``pairings`` the first is that of ``pairs``.
+    The first of ``pairings`` is that of ``pairs``.
     """
 
     settings: PidSettings | Loops

@@ -105,7 +105,7 @@ def held_rest(model: Identified, loads: Loads) -> Tensor:
 def balanced(model: Identified, loads: Loads, span: Tensor, horizon: int) -> Tensor:
     """The largest loads (n_d,) that MVs of ``span`` (n_mv,), scaled, can balance; under larger ones nothing rests.
 
-    What a load makes of the output that it moves most, over the horizon, is what the MVs' whole ranges can.
+    The largest load moves an output over the horizon as far as the MVs' whole ranges can.
     """
     a, b = slopes_at_rest(model)
     by_mv, by_load = (answers(a, into, horizon)[-1, : model.n_y] for into in (b[:, : model.n_mv], _entry(b, loads)))

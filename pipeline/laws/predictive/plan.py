@@ -40,11 +40,11 @@ class Planner(nn.Module):
         sum w (e + S dz)^2/2 + mu sum_j |z_j - z_{j-1}|^2 + kappa sum_p H_pp dz_p^2/2
 
     within its bounds, by ``sweeps`` rounds of coordinate descent; H_pp is the curvature of the other terms. A fixed
-    point is a minimum of the cost itself, whatever the damping kappa. Without damping full steps over a strongly
-    bent model can throw the plan from pass to pass, and the loop then amplifies rounding. An error counts by its
-    size, not by its square: large ones do not decide alone. With ``rate`` (n_mv,) each move differs from the one
-    before by at most its length in samples times the rate. What ``limits`` cost is added, by a quadratic of the same
-    kind; no quadratic stands for a limit that the present plan keeps, so that it does not slow down the approach.
+    point is a minimum of the cost itself, whatever the damping kappa. Without damping full steps over a strongly bent
+    model can throw the plan from pass to pass, and the loop then amplifies rounding. An error counts by its size, not
+    by its square: large ones do not decide alone. With ``rate`` (n_mv,) each move differs from the one before by at
+    most its length in samples times the rate. The cost of ``limits`` is added, by a quadratic of the same kind; no
+    quadratic stands for a limit that the present plan keeps, so that it does not slow down the approach.
 
     Source: iteratively reweighted least squares, Huber, Robust Statistics, section 7.8; coordinate descent, Wright,
     Mathematical Programming 151 (2015) 3.

@@ -27,7 +27,7 @@ class Sight:
     @classmethod
     @torch.no_grad()
     def of(cls, model: Identified, mv_of: Callable[[Tensor], Tensor], n_cv: int) -> Sight:
-        """Of the model's step responses; ``mv_of`` as in ``horizon_for``."""
+        """From the model's step responses; ``mv_of`` as in ``horizon_for``."""
         responses = step_responses(model, mv_of)
         settling = settling_times(responses)
         settles = int(np.ceil(np.quantile(settling, SHARE))) if settling.size else 0
@@ -46,7 +46,7 @@ class Sight:
             )
 
     def notes(self, horizon: int) -> tuple[str, ...]:
-        """What a report says of a horizon that ends before half of the answers' settling after the dead time."""
+        """The words of a report on a horizon that ends before half of the answers' settling after the dead time."""
         wanted = (self.first + self.settles) / 2
         if horizon >= wanted:
             return ()

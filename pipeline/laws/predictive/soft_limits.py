@@ -15,14 +15,14 @@ SOFT = 0.003  # scaled: where the curvature begins, so that the law has no jump 
 
 
 class Push(NamedTuple):
-    """Of each output over the horizon: the weight of a quadratic that stands for the limits' cost, and its slope."""
+    """For each output over the horizon: the weight of a quadratic that stands for the limits' cost, and its slope."""
 
     weight: Tensor  # (..., 1, N n_cv)
     slope: Tensor  # (..., 1, N n_cv)
 
 
 class SoftLimits(nn.Module):
-    """What the outputs cost beyond their limits: sum p(b) over all samples, with the slope of p.
+    """The cost of outputs beyond their limits: sum p(b) over all samples, with the slope of p.
 
         p'(b) = w(b) b,   w(b) = rho |b|/((|b| + delta) sqrt(b^2 + eps^2)),   b = y - clip(y, low, high)
 

@@ -162,7 +162,7 @@ class Trials:
 
     @cached_property
     def _remembers(self) -> Tensor:
-        """Which states (n_x,) are copies of another state or an input of the period before."""
+        """The states (n_x,) that are copies of another state or an input of the period before."""
         m = self.model
         return torch.from_numpy(shift_rows(StateEquation(*(t.numpy() for t in (m.a, m.b, m.c, m.w1, m.b1, m.w2)))))
 

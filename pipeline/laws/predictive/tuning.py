@@ -49,7 +49,7 @@ class Candidate:
 
 
 class Tries(Protocol):
-    """What runs laws side by side: ``Trials``."""
+    """Loops of laws side by side: ``Trials``."""
 
     def run(self, laws: ControlLaw, count: int) -> Outcome:
         """The loops of ``count`` laws."""
@@ -73,7 +73,7 @@ def judged(outcome: Outcome, given: Outcome, numbers: Sequence[Numbers]) -> list
 
 
 def calmest(tried: Sequence[Candidate]) -> Candidate:
-    """Of the numbers whose error is at most ``CALM`` more than the least, those of the least travel.
+    """The numbers of the least travel among those whose error is at most ``CALM`` more than the least.
 
     The travel is not in the limit: counted there too, it cost several times these 5 % on plants whose loads wander.
     """
@@ -125,7 +125,7 @@ def searched(
 
 @dataclass(frozen=True, slots=True)
 class Tuned:
-    """What a search found: the best numbers, the damping of the passes (None: no reason for any), all that it tried."""
+    """Result of a search: the best numbers, the damping of the passes (None: no reason for any), all that it tried."""
 
     numbers: Numbers
     damping: float | None
@@ -140,8 +140,8 @@ def tuned(
 ) -> Tuned:
     """The best numbers of the laws ``law_of(numbers, damping)``; without a ``damping`` the least that the loops stand.
 
-    That is the least with which a small difference does not grow in the loops. Where it grows with each, the model is
-    to blame and not the passes, and the law keeps its own.
+    The damping is the least with which a small difference does not grow in the loops. Where it grows with each, the
+    model is to blame and not the passes, and the law keeps its own.
     """
 
     def stood(numbers: Numbers, least: float) -> float | None:
@@ -155,7 +155,7 @@ def tuned(
 
 
 def in_words(tried: Sequence[Candidate]) -> str:
-    """What a search tried, the first one it started from, and what it gained, for the report."""
+    """The numbers that a search tried, its start first, and its gain, for the report."""
     first, last = tried[0].cost, min(c.cost for c in tried)
     return (
         f"{len(tried)} sets of numbers were tried in closed loops over the model with errors of gain, pace and dead "

@@ -95,7 +95,7 @@ class IncrementalNetwork(Network):
     In scaled units, with z = [u(k-1), y], E = [e, e - e(k-1), r - y_m, x_m,2 .. x_m,n], and the hidden
     units j. Where all errors are zero the move is zero, whatever the weights. At rest E = [e, 0, .., 0], and
     w_j = exp(.) > 0 with the weights of e = sign exp(.): the move then has the sign of sign e and no other
-    root. What is trained are the exponents.
+    root. Training moves the exponents.
     """
 
     @property

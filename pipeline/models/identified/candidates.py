@@ -290,8 +290,8 @@ def visited(model: Dynamics, train: list[Stretch], correction: float) -> Array:
 def wild(model: Dynamics, problem: Problem) -> bool:
     """Whether the model does not settle over the inputs of the data.
 
-    That is: an output goes beyond all bounds under one of them held constant, or swings under a tenth of them, or does
-    not come back from states far outside the visited ones while the inputs change.
+    An unusable one: an output goes beyond all bounds under one of them held constant, or swings under a tenth of them,
+    or does not come back from states far outside the visited ones while the inputs change.
     """
     n_y, v = problem.data.y.shape[1], _held_inputs(problem)
     x, share = rests_under(model, problem)

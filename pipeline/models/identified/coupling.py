@@ -1,6 +1,6 @@
 """Whether a controller of several loops stands what a record leaves open of a few answers.
 
-Of a plant of several MVs an answer may be too small beside the noise to be certain in sign, and decide nothing: a
+With several MVs an answer may be too small beside the noise to be certain in sign, and decide nothing: a
 controller that takes it for the model's goes to the set points all the same.
 """
 

@@ -1,4 +1,4 @@
-"""What a record leaves open of its model: gain, speed and dead time, and the colour of the measurement noise."""
+"""Uncertainty that a record leaves of its model: gain, speed and dead time, and the colour of the measurement noise."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MIDDLE, ENOUGH = (0.159, 0.841), 8
 """Quantiles one standard deviation from the median of a normal sample, and members from which they are told."""
 
 MOST_COLOUR = 0.95
-"""Of the noise: what is slower is a disturbance."""
+"""Largest colour of the noise: a slower one is a disturbance."""
 
 
 class Doubt(NamedTuple):
@@ -38,7 +38,7 @@ class Doubt(NamedTuple):
 def doubt_of(curves: Array, n_mv: int) -> Doubt:
     """From the models' scaled step responses (members, n_v, length, n_y), the MVs' first.
 
-    Of each MV the output counts that it moves most. Speed and dead time are those of the MV that is least certain,
+    For each MV the output counts that it moves most. Speed and dead time are those of the MV that is least certain,
     as all inputs of a plant share its dynamics. Answers that go on are taken over the rows that a predictive
     law looks ahead at most: a pole near 1 is never certain, and what it makes of hundreds of rows hides how well the
     first ones are known.
@@ -60,7 +60,7 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
 
 
 def _strongest(curves: Array) -> Array:
-    """Of curves (members, length, n_y) those of the output (members, length) that is moved most at their end."""
+    """Curves (members, length) of the output moved most at its end, from those of all (members, length, n_y)."""
     return np.asarray(curves[..., int(np.abs(np.median(curves[:, -1], axis=0)).argmax())])
 
 

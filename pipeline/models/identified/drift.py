@@ -15,7 +15,7 @@ PARTS = (8, 16, 32, 64, 128)
 """Numbers of parts of the record that get a gain and a level of their own: drift may be slow or quick."""
 
 LEAST_ROWS = 50
-"""Of a part."""
+"""Fewest rows of a part."""
 
 EXPLAINED = 0.5
 """Share of the residual's power, beyond the noise, that they must explain."""

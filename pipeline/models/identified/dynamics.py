@@ -80,7 +80,7 @@ class Dynamics(StateEquation):
         return replace(self, **parts)
 
     def mask(self, **free: bool | NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which entries of ``vector`` are free (P,): each field by name, as a whole or as a mask of its shape."""
+        """The entries of ``vector`` that are free (P,): each field by name, as a whole or as a mask of its shape."""
         parts = []
         for f in fields(self):
             value = getattr(self, f.name)

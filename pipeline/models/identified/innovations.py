@@ -35,7 +35,7 @@ AHEAD = 30
 """Rows that figures of a model with its noise are predicted ahead, at most: about as far as a controller looks."""
 
 ALIKE = 1e-6
-"""Of the innovations' variance, that two outputs do not share."""
+"""Share of the innovations' variance that two outputs do not have in common."""
 
 LEAST_NOISE = 0.01
 """Share of an innovation's variance that is at least measurement noise."""

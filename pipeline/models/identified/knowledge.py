@@ -1,4 +1,4 @@
-"""What an engineer knows of pairs of output and input, as the search for a model uses it: scaled, in periods."""
+"""An engineer's knowledge of pairs of output and input, as the search for a model uses it: scaled, in periods."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from pipeline.plants.simulator import Array
 
 ROUNDING = 1e-6
-"""Of a period: a dead time of whole periods in seconds is that many periods."""
+"""Share of a period: a dead time of whole periods in seconds is that many periods."""
 
 Model = TypeVar("Model", bound=Dynamics)
 Against = frozenset[int]
@@ -48,7 +48,7 @@ class Knowledge:
     def of(
         cls, known: Sequence[Known], pvs: Sequence[str], inputs: Sequence[str], scales: Scales, period_s: float
     ) -> Knowledge:
-        """Of statements on signals by name; those on PVs that are no output of the model say nothing of it."""
+        """From statements on signals by name; those on PVs that are no output of the model say nothing of it."""
         pairs = []
         for one in (k for k in known if k.pv in pvs):
             i, j = pvs.index(one.pv), inputs.index(one.input)
@@ -130,7 +130,7 @@ class Knowledge:
     def against(self, model: Dynamics, data: ScaledRecord) -> Against:
         """The pairs whose steady gain at the middle of the data contradicts what is known.
 
-        Of an output that integrates its slope stands for the gain, and its sign alone is compared.
+        The slope of an output that integrates stands for the gain, and its sign alone is compared.
         """
         if not self.pairs:
             return frozenset()

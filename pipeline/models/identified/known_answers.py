@@ -1,4 +1,4 @@
-"""What an engineer knows of the plant beside the fitted model, and beside the record that it is fitted to."""
+"""An engineer's knowledge of the plant beside the fitted model, and beside the record that it is fitted to."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ AGREES, OPEN, MODEL, CONTRADICTED, UNUSED = "agrees", "open", "model", "contradi
 def known_figures(
     statements: Sequence[Beside], gains: Mapping[str, Mapping[str, Mapping[str, Any]]], record: Record
 ) -> list[dict[str, Any]]:
-    """Of each statement: what it ``says``, the sign ``way`` of it, whether it has a ``size``, and a ``verdict``.
+    """For each statement: what it ``says``, the sign ``way`` of it, whether it has a ``size``, and a ``verdict``.
 
     ``contradicted``: the record is certain of another sign or gain; ``question`` then says what to ask. ``model``: the
     model has another one, and the record is not certain. ``open``: nor does the record say so, and the statement

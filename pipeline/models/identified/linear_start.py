@@ -141,7 +141,7 @@ class Realizations:
 
     @classmethod
     def of(cls, response: Array, weight: Array) -> Realizations:
-        """Of an impulse response (2m, n_y, n_v), its inputs weighted by their deviations (n_v,).
+        """From an impulse response (2m, n_y, n_v), its inputs weighted by their deviations (n_v,).
 
         Raises ModelError where it grows without limit.
         """

@@ -299,7 +299,7 @@ class NoiseSearch:
 def _of_lags(trial: Trial, inputs: Sequence[int], n_y: int) -> float:
     """Share of the time to half of an answer that is no dead time, the mean of some inputs' answers.
 
-    Of each input the answer counts of the output that it moves most, over the rows that a law looks ahead at most.
+    For each input the answer counts of the output that it moves most, over the rows that a law looks ahead at most.
     """
     model = trial.of_fold(trial.folds[0])[0].model.plant
     size = np.ones(model.n_v)

@@ -36,7 +36,7 @@ class Cells:
 
     @classmethod
     def of(cls, members: Sequence[Dynamics], data: ScaledRecord, n_mv: int, length: int) -> Self:
-        """Of models without loads, over ``length`` rows; 0 where a run explodes."""
+        """From models without loads, over ``length`` rows; 0 where a run explodes."""
         edges = [_edges(data.v[:, j]) for j in range(n_mv)]
         places = [(j, low, high) for j, of in enumerate(edges) for low, high in pairwise(of)]
         below = np.tile(np.median(data.v, axis=0), (len(places), 1))

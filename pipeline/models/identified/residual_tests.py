@@ -1,4 +1,4 @@
-"""What the residual of a free run says: dynamics that are missing, noise that has a colour."""
+"""Findings in the residual of a free run: dynamics that are missing, noise that has a colour."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LAGS = 25
 def residual_figures(
     residuals: Sequence[Array], inputs: Sequence[Array], names: Sequence[str]
 ) -> dict[str, dict[str, float]]:
-    """Of each PV's free-run residual: shares of its correlations outside the 99 % band of a white one.
+    """For each PV's free-run residual: shares of its correlations outside the 99 % band of a white one.
 
     ``autocorrelated`` over lags 1 .. 25, ``input_correlated`` with the inputs at lags 0 .. 25; .01 is what chance
     gives. A share of the second far above that says that dynamics are missing; the first also sees coloured noise.

@@ -17,7 +17,7 @@ from pipeline.models.identified.trial import Trial
 class Rounds:
     """Runs rounds of fits on one problem under one budget; ``label`` names them while they run.
 
-    What a round does depends on its tasks and on nominal costs alone, never on how many processes share it.
+    A round depends on its tasks and on nominal costs alone, never on how many processes share it.
     """
 
     problem: Problem

@@ -1,4 +1,4 @@
-"""In which row an MV acts: on the outputs of the next row, or, where a logger stores it late, on those of its own."""
+"""The row on whose outputs an MV acts: the next one, or, where a logger stores it late, its own."""
 
 from __future__ import annotations
 

@@ -59,8 +59,8 @@ class Selection:
     def nonlinear(self) -> bool:
         """Whether the network wins by more than the standard error of its seeds' median, and by more than ``GAIN``.
 
-        In a record that drifts the seeds differ by what each took for drift, so that ``GAIN`` alone decides. Of
-        one-step errors noise is nearly all, and their log-likelihood decides.
+        In a record that drifts the seeds differ by what each took for drift, so that ``GAIN`` alone decides. Noise is
+        nearly all of one-step errors, and their log-likelihood decides.
         """
         if self.network is None:
             return False

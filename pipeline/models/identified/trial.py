@@ -39,7 +39,7 @@ class Trial:
 
     @property
     def rank(self) -> tuple[int, float]:
-        """What candidates are sorted by: the less they contradict what is known the better, then the error."""
+        """Key by which candidates are sorted: contradictions of knowledge first, then the error."""
         return self.against, self.error
 
     @property

@@ -97,7 +97,7 @@ def free_run_figures(
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
     """(figures of each PV, {measured, free run} (n, n_y)) of a fold's best fit over the rows that it never saw.
 
-    Of a model with its noise the runs begin anew from its filter every ``AHEAD`` rows: a run over all of them would
+    Runs of a model with its noise begin anew from its filter every ``AHEAD`` rows: a run over all of them would
     hold the loads that the controller fought, and say nothing of the model.
     ``free_run_rmse`` and the PV's own deviation ``held_sd`` in its unit, ``fit_percent``, ``rmse_by_third``: where the
     PV was low, in the middle and high, and ``outside_training``: the share of these rows in which it left the range of
@@ -179,7 +179,7 @@ def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_]
 def gain_figures(
     members: Sequence[Dynamics], data: ScaledRecord, scales: Scales, pvs: Sequence[Signal], inputs: Sequence[Signal]
 ) -> dict[str, Any]:
-    """Of each PV and input: the steady gain [PV/input], its spread over the members, its sign, its range over the data.
+    """The steady gain [PV/input] of each PV and input, its spread over the members, its sign, its range over the data.
 
     ``gain`` is taken where all inputs are at the medians of the data; where ``rate`` is true it is in PV/input a
     period. ``sign`` is uncertain where the gain lies within ``SURE`` spreads of zero; ``varies`` is the ratio of the

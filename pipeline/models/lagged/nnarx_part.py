@@ -58,7 +58,7 @@ def parsimonious(candidates: Sequence[Candidate], slack: float = SLACK) -> int:
 
     Differences of a few per cent between free-run errors lie within what another draw of the
     initial weights changes, and each parameter less is one less to mislead the model's slopes,
-    by which controllers are tuned. Of equal sizes the better free run wins.
+    by which controllers are tuned. The better free run wins among equal sizes.
     Raises ModelError without a candidate.
     """
     if not candidates:

@@ -18,7 +18,7 @@ from pipeline.records.record import Record
 
 FORGETTING = (0.8, 0.5)
 VARIANCE = 100.0
-"""Of a recursive model's parameters at the start: an open mind, for regressors of the order of one."""
+"""Variance of a recursive model's parameters at the start: an open mind, for regressors of the order of one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ class RecursiveLeastSquares(nn.Module):
         P     = (P - K phi' P) / f
 
     so that theta(N) minimizes sum_k f^(N-k) (y_k - phi_k' theta)^2 + f^N |theta - theta0|^2 in the
-    metric of P0^-1. What is kept is a square root of the covariance, P = S S', by Potter's form:
+    metric of P0^-1. The state is a square root of the covariance, P = S S', by Potter's form:
 
         w = S' phi,  beta = f + w'w,  K = S w / beta,  S = (S - S w w' / (beta + sqrt(f beta))) / sqrt(f)
 

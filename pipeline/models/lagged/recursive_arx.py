@@ -99,7 +99,7 @@ class RecursiveArx(nn.Module):
         }
 
     def sample(self, p: Named) -> Sample:
-        """What the past and the sample say of the model, scaled."""
+        """Regressors from the past and the sample, scaled."""
         now, ahead = (self._scaled(x) for x in regressors(p, self.n_y, self.n_u))
         eta = (p["y"] - self.middle_y) / self.half_y
         for i, weight in enumerate(self.prefilter):

@@ -42,7 +42,7 @@ class StateWindows(Rows):
 
     @classmethod
     def of(cls, record: Record, steps: int, *, every: int = 1) -> Self:
-        """Of all windows of ``steps`` periods each ``every``-th, none reaching over the end of a run.
+        """Each ``every``-th of all windows of ``steps`` periods, none reaching over the end of a run.
 
         Raises RecordError where no run is long enough.
         """

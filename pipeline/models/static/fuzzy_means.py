@@ -75,7 +75,7 @@ def select_centres(u: Array, partitions: int) -> NDArray[np.int64]:
 
 
 def _covered(g: Array, centres: Array, reach: float) -> NDArray[np.bool_]:
-    """Which samples some centre covers."""
+    """The samples that some centre covers."""
     return np.asarray((cdist(g, centres, "sqeuclidean") <= reach).any(axis=1))
 
 

@@ -25,12 +25,11 @@ def solve_iterative(
 ) -> Tensor:
     """The same weights to a relative ``tolerance`` of the residual's norm, without the QR of all rows.
 
-    Samples in one cell of the grid give nearly equal rows of Z. So the R factor of a few rows of
-    each cell (``strata`` (K,) numbers the cells 0, 1, ...), each weighted by the number of rows it
-    stands for, makes Z R^-1 nearly orthogonal: singular values of about 0.7 to 1.6, where those of
-    Z span eight decades. Conjugate gradients on it gain half a decade an iteration. As Z R^-1 is
-    nearly orthogonal, the gradient's norm is the distance to the solution in the space of the
-    predictions, which is what ``tolerance`` bounds.
+    Samples in one cell of the grid give nearly equal rows of Z. So the R factor of a few rows of each cell (``strata``
+    (K,) numbers the cells 0, 1, ...), each weighted by the number of rows it stands for, makes Z R^-1 nearly
+    orthogonal: singular values of about 0.7 to 1.6, where those of Z span eight decades. Conjugate gradients on it gain
+    half a decade an iteration. Z R^-1 is nearly orthogonal, so that the gradient's norm is the distance to the solution
+    in the space of the predictions, which is what ``tolerance`` bounds.
 
     Falls back on ``solve_qr`` where the sample would be most of the data or does not hold the
     column space of Z.

@@ -40,7 +40,7 @@ class LeverageDomain(Model):
     no difference of large numbers.
 
     An input is inside where h(u) <= h* = 3 (N+1)/K, three times the mean leverage of the data.
-    As a model: ``(..., N) -> (..., 1)``, the leverage.
+    The leverage as a model: ``(..., N) -> (..., 1)``.
 
     Source: [inverse_rbf, eqs 13-20], with the intercept that centring stands for.
     """

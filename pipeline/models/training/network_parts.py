@@ -33,7 +33,7 @@ class LongRun:
     predicted: Array
 
     def figures(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
-        """Of each PV: RMSE one step ahead, RMSE [unit of the PV] and fit [%] of the free runs."""
+        """For each PV: RMSE one step ahead, RMSE [unit of the PV] and fit [%] of the free runs."""
         return {
             name: {
                 "one_step_rmse": rmse(*(side[:, i] for side in self.one_step)),

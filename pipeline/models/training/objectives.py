@@ -142,7 +142,7 @@ class Windows(Rows):
     ) -> Self:
         """Windows of ``steps`` samples of one PV of a record, none reaching over the end of a run.
 
-        Lags and delay as in ``nnarx_pairs``. Of all windows each ``every``-th; with ``least_back`` rows before
+        Lags and delay as in ``nnarx_pairs``. Each ``every``-th of all windows; with ``least_back`` rows before
         a window's last measured one, although these lags may need fewer: so that models of other lags are
         compared over the same windows. Raises RecordError where no run is long enough.
         """

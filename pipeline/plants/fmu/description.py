@@ -1,4 +1,4 @@
-"""What an FMU says of itself in modelDescription.xml: its real variables, its step, and what it can do."""
+"""The modelDescription.xml of an FMU: its real variables, its step, and what it can do."""
 
 from __future__ import annotations
 

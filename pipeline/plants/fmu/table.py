@@ -1,4 +1,4 @@
-"""Which variables of an FMU are the plant's signals; an FMU itself does not say what is manipulated or measured."""
+"""The variables of an FMU that are the plant's signals; an FMU itself does not say what is manipulated or measured."""
 
 from __future__ import annotations
 
