@@ -396,7 +396,7 @@ class OpcUaEndpoint:
         except EndpointError as error:
             self._failed(first_line(error))
             raise
-        names = ["hand_back"] if handing else plan.mv_names
+        names = ["hand_back"] if handing else [s.name for s in self.manifest.mv]
         wrong = [f"{name}: {words(s)}" for name, s in zip(names, statuses, strict=True) if s >> 30 != GOOD]
         if wrong:
             self._failed(f"the server refuses {', '.join(wrong)}")

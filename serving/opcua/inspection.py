@@ -19,7 +19,6 @@ from serving.opcua.certificates import last_day, valid_until
 from serving.opcua.lease import NAME, WRITABLE, SeveralLeasesError, beside
 from serving.opcua.link import Link
 from serving.opcua.nameplates import (
-    WRITTEN,
     Identity,
     Plate,
     by_name,
@@ -28,11 +27,10 @@ from serving.opcua.nameplates import (
     other_unit,
     plates,
     renumbered,
-    signal_of,
     uri_of,
     whole,
 )
-from serving.opcua.plan import Plan, shared_node
+from serving.opcua.plan import Plan, Role, Row, shared_node
 from serving.opcua.sampling import NO_NUMBERS
 from serving.opcua.settings import NO_LEASE, Nodes, Point, Server
 from serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, exact, words
@@ -64,6 +62,7 @@ class Found:
     wrong: str = ""
     note: str = ""
     passing: bool = False
+    written: bool = False  # by the loop
 
 
 class _Asked(NamedTuple):
@@ -85,7 +84,7 @@ class Inspection:
     def lasting(self, *, writes: bool) -> list[str]:
         """A line for all that would stop the loop for good; ``writes``: whether it is to write at once."""
         wrong = [row for row in self.rows if row.wrong and not row.passing]
-        return [f"{row.signal}: {row.wrong}" for row in wrong if writes or not row.signal.endswith(", written")]
+        return [f"{row.signal}: {row.wrong}" for row in wrong if writes or not row.written]
 
 
 def inspected(
@@ -108,30 +107,27 @@ async def _inspected(
     try:
         plan = Plan(nodes, manifest)
         # A watchdog that cannot be read counts as dead, though no sample is judged by its quality.
-        rows = [(name, p.read_back or p.node, p, judged or name == "watchdog") for name, p, judged in plan.points]
-        rows += [(f"MV {s.name}, written", p.node, p, True) for s, p in zip(manifest.mv, plan.mv_points, strict=True)]
-        beat, back = nodes.heartbeat, nodes.hand_back
-        rows += [("heartbeat, written", beat, Point(beat), True)] if beat else []
-        rows += [("hand_back, written", back.node, Point(back.node), True)] if back is not None else []
+        read = [replace(row, judged=row.judged or row.role is Role.WATCHDOG) for row in plan.rows]
+        rows = [*read, *plan.outputs, *plan.extra]
         several = ""
         try:
             lease = await _lease_of(link, server, nodes)
         except SeveralLeasesError as error:
             lease, several = "", first_line(error)
-        asked = await _asked(link, server, [node for _, node, _, _ in rows] + ([lease] if lease else []))
-        found = [_one(manifest, server, *row, asked[row[1]], margin) for row in rows]
+        asked = await _asked(link, server, [row.node for row in rows] + ([lease] if lease else []))
+        found = [_one(server, row, asked[row.node], margin) for row in rows]
+        back = nodes.hand_back
         if back is not None and not found[-1].wrong:
             found[-1] = replace(found[-1], wrong=_unfit(back.value, found[-1].kind))
         if several:
-            found.append(Found("lease, written", "-", wrong=several))
+            found.append(Found("lease, written", "-", wrong=several, written=True))
         elif lease:
             found.append(_lease(lease, asked[lease]))
         else:
             found.append(Found("lease", "-", note="" if nodes.lease == NO_LEASE else NO_LEASE_NOTE))
-        targets = [(f.signal.removesuffix(WRITTEN), a.at) for f in found if f.signal.endswith(WRITTEN)
-                   and isinstance(a := asked.get(f.node, ""), _Asked)]  # fmt: skip
-        shared = shared_node([name for name, _ in targets], [at for _, at in targets])
-        found += [Found("nodes, written", "-", wrong=shared)] if shared else []
+        targets = [(row, a.at) for row in rows if row.written and isinstance(a := asked[row.node], _Asked)]
+        shared = shared_node([row for row, _ in targets], [at for _, at in targets])
+        found += [Found("nodes, written", "-", wrong=shared, written=True)] if shared else []
         found += _namespaces(nodes, await link.namespaces(server.connect_s), spaces)
         try:
             known = await identity(link, nodes, await link.started_s(server.connect_s), server.connect_s)
@@ -211,7 +207,7 @@ def _lease(node: str, asked: _Asked | str) -> Found:
     """The text node by which loops on different machines find each other: without it no MV is written."""
     name = "lease, written"
     if isinstance(asked, str):
-        return Found(name, node, wrong=asked)
+        return Found(name, node, wrong=asked, written=True)
     reading, writable = asked.reading, asked.writable
     kind = reading.kind.name if reading.kind is not None else "-"
     wrong = ""
@@ -224,7 +220,9 @@ def _lease(node: str, asked: _Asked | str) -> Found:
     owner = reading.words_held.partition(" ")[0]
     note = f"{owner} has the plant, or had it last" if owner else ""
     quality = "Good" if reading.quality == GOOD else words(reading.status)
-    return Found(name, node, kind, owner or "-", quality=quality, writable=MAY[writable], wrong=wrong, note=note)
+    return Found(
+        name, node, kind, owner or "-", quality=quality, writable=MAY[writable], wrong=wrong, note=note, written=True
+    )
 
 
 def _bad(reading: Reading, node: str) -> str:
@@ -241,12 +239,12 @@ def _unfit(value: float, kind: str) -> str:
     return ""
 
 
-def _refused(name: str, signal: Signal, number: float, margin: float) -> str:
+def _refused(row: Row, signal: Signal, number: float, margin: float) -> str:
     """Why a guard of the loop refuses a number; empty where none does: only PVs and the MVs read back have one."""
     values = np.array([number])
-    if name.startswith("PV "):
+    if row.role is Role.PV:
         refusal = InRange((signal,), margin).check(Sample(values), ())
-    elif name.startswith("MV ") and not name.endswith(", written"):
+    elif row.role is Role.MV and not row.written:
         refusal = implausible((signal,), [number])
     else:
         refusal = None
@@ -259,34 +257,25 @@ def _outside(signal: Signal, number: float) -> str:
     return f"{number:.6g} lies outside {signal.low:g} .. {signal.high:g} {signal.unit}; another unit?"
 
 
-def _one(
-    manifest: Manifest,
-    server: Server,
-    name: str,
-    node: str,
-    point: Point,
-    judged: bool,
-    asked: _Asked | str,
-    margin: float,
-) -> Found:
+def _one(server: Server, row: Row, asked: _Asked | str, margin: float) -> Found:
+    name, node, point, signal = row.name, row.node, row.point, row.signal
     if isinstance(asked, str):
-        return Found(name, node, wrong=asked)
+        return Found(name, node, wrong=asked, written=row.written)
     _, reading, writable, (unit, limits) = asked
     kind = reading.kind.name if reading.kind is not None else "-"
     number = point.scale * reading.number + point.offset
     age = "-" if reading.source_s is None else f"{time.time() - reading.source_s:.3g} s"
-    signal = signal_of(manifest, name)
     wrong, passing = "", False
     if reading.quality == BAD or (reading.quality == UNCERTAIN and server.uncertain == "fault"):
         wrong, passing = _bad(reading, node), words(reading.status) != "BadNodeIdUnknown"
     elif reading.text:
         wrong, passing = f"it holds {reading.text}", reading.text in NO_NUMBERS
-    elif name.endswith(", written") and reading.kind not in {*FLOATS, *INTEGERS, ua.VariantType.Boolean}:
+    elif row.written and reading.kind not in {*FLOATS, *INTEGERS, ua.VariantType.Boolean}:
         wrong = f"its type {kind} holds no number"
-    elif name.endswith(", written") and writable is False:
+    elif row.written and writable is False:
         wrong = "it may not be written by this user"
     elif signal is not None:
-        wrong, passing = _refused(name, signal, number, margin), True
+        wrong, passing = _refused(row, signal, number, margin), True
     note = ""
     if signal is not None:
         outside = "" if wrong or reading.text else _outside(signal, number)
@@ -294,10 +283,10 @@ def _one(
         wrong, passing = (misfit, False) if misfit else (wrong, passing)
         note = "; ".join(filter(None, (outside, _other_range(limits, point, signal))))
     quality = "Good" if reading.quality == GOOD else words(reading.status)
-    if not judged:
+    if not row.judged:
         wrong, note = "", "; ".join(filter(None, (wrong, note)))
     shown = "-" if reading.text else f"{number:.6g}"
-    return Found(name, node, kind, shown, unit, quality, age, limits, MAY[writable], wrong, note, passing)
+    return Found(name, node, kind, shown, unit, quality, age, limits, MAY[writable], wrong, note, passing, row.written)
 
 
 def _other_range(limits: str, point: Point, signal: Signal) -> str:

@@ -19,14 +19,13 @@ from serving.fault import Fault
 from serving.manifest import Manifest, Signal
 from serving.opcua.answers import unanswered
 from serving.opcua.link import Link, node_id
-from serving.opcua.plan import Plan
+from serving.opcua.plan import Plan, Role, Row
 from serving.opcua.settings import Nodes, Point
 from serving.opcua.values import FLOATS, INTEGERS
 
 LOOK_S, WRONG_S = 60.0, 2.0  # between two looks at what may change without a new connection; while something is wrong
 UNKNOWN = "-"
 NULL = ua.VariantType.Null
-WRITTEN = ", written"  # of a row: the node that the loop writes, where the MV is read back from another one
 NUMBERS = {*FLOATS, *INTEGERS}
 ANY = {ua.ObjectIds.BaseDataType, ua.ObjectIds.Number, ua.ObjectIds.Integer, ua.ObjectIds.UInteger}
 
@@ -89,7 +88,7 @@ class Nameplates:
         self.moved: ChangedNodeError | None = None  # what ``watch`` has found
         self._kinds: dict[str, ua.VariantType] = {}
         self._plates: dict[str, Plate] = {}
-        self._wrong: dict[tuple[str, str], str] = {}  # why, by row and what of it is wrong
+        self._wrong: dict[tuple[Row, str], str] = {}  # why, by row and what of it is wrong
         self._any_number: set[str] = set()  # rows whose nodes are declared to hold numbers of any type
 
     async def require_spaces(self, link: Link, timeout_s: float, *, anew: bool = False) -> None:
@@ -105,11 +104,12 @@ class Nameplates:
             if uri:
                 self.spaces[number] = uri
 
-    def typed(self, name: str, kind: ua.VariantType | None) -> str:
+    def typed(self, row: Row, kind: ua.VariantType | None) -> str:
         """Why a node's type is another one than the loop began with; empty where it is the same, or not known."""
         if kind in {None, NULL}:
             return ""
         assert kind is not None
+        name = row.name
         before = self._kinds.setdefault(name, kind)
         if kind is before or (name in self._any_number and {kind, before} <= NUMBERS):
             return ""
@@ -119,29 +119,28 @@ class Nameplates:
     async def look(self, link: Link, plan: Plan, timeout_s: float) -> None:
         """See which unit, range and type each node has now; EndpointError where nobody answers."""
         rows = plan.measuring()
-        nodes = [node for _, _, node in rows]
+        nodes = [node for _, node in rows]
         found, kinds = await plates(link, nodes, timeout_s), await link.read(nodes, timeout_s)
-        mode = [(n, p, at) for (n, p, _), at in zip(plan.points, plan.asked, strict=False) if n == "mode"]
-        declared = await any_number(link, [node for _, _, node in [*rows, *mode]], timeout_s)
-        for (name, _, _), free in zip([*rows, *mode], declared, strict=True):
+        mode = [(row, at) for row, at in zip(plan.rows, plan.asked, strict=False) if row.role is Role.MODE]
+        declared = await any_number(link, [node for _, node in [*rows, *mode]], timeout_s)
+        for (row, _), free in zip([*rows, *mode], declared, strict=True):
             if free is not None:
-                (self._any_number.add if free else self._any_number.discard)(name)
-        for (name, point, _), plate, answer in zip(rows, found, kinds, strict=True):
-            self._compare(name, point, plate)
-            changed = self.typed(name, answer.kind)
-            if name.endswith(WRITTEN) and answer.kind not in {None, NULL}:  # the others are judged at each reading
-                self._judge(name, "type", changed)
-        self.wrong = {name: why for (name, _), why in reversed(self._wrong.items())}
-        self.fault = next((why for (name, _), why in self._wrong.items() if measured(name)), "")
-        self.unwritable = next((why for (name, _), why in self._wrong.items() if name.endswith(WRITTEN)), "")
+                (self._any_number.add if free else self._any_number.discard)(row.name)
+        for (row, _), plate, answer in zip(rows, found, kinds, strict=True):
+            self._compare(row, plate)
+            changed = self.typed(row, answer.kind)
+            if row.written and answer.kind not in {None, NULL}:  # the others are judged at each reading
+                self._judge(row, "type", changed)
+        self.wrong = {row.name: why for (row, _), why in reversed(self._wrong.items())}
+        self.fault = next((why for (row, _), why in self._wrong.items() if row.measured), "")
+        self.unwritable = next((why for (row, _), why in self._wrong.items() if row.written), "")
 
     def seen(self, plan: Plan) -> dict[str, Seen]:
         """The nodes by row as they were when the loop began."""
         found = {}
-        for name, point, _ in plan.measuring():
-            kind, plate = self._kinds.get(name), self._plates.get(name, Plate())
-            node = point.node if name.endswith(WRITTEN) else point.read_back or point.node
-            found[name] = Seen(node, UNKNOWN if kind is None else kind.name, *plate)
+        for row, _ in plan.measuring():
+            kind, plate = self._kinds.get(row.name), self._plates.get(row.name, Plate())
+            found[row.name] = Seen(row.node, UNKNOWN if kind is None else kind.name, *plate)
         return found
 
     async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
@@ -162,26 +161,25 @@ class Nameplates:
         await self.require_spaces(link, timeout_s, anew=True)
         await self.look(link, plan, timeout_s)
 
-    def _compare(self, name: str, point: Point, now: Plate) -> None:
+    def _compare(self, row: Row, now: Plate) -> None:
         """Begin or end the faults of a node's unit and range; what the server does not tell does neither."""
-        before = self._plates.get(name, Plate())
-        self._plates[name] = Plate(*(n if b == UNKNOWN else b for b, n in zip(before, now, strict=True)))
-        signal = signal_of(self.manifest, name)
+        before = self._plates.get(row.name, Plate())
+        self._plates[row.name] = Plate(*(n if b == UNKNOWN else b for b, n in zip(before, now, strict=True)))
         for what, was, is_now in zip(("unit", "range"), before, now, strict=True):
             if is_now == UNKNOWN:
                 continue
-            judged = what == "unit" and signal is not None and not name.startswith("SP ")
-            misfit = other_unit(is_now, point, signal) if judged and signal is not None else ""
+            judged = what == "unit" and row.role is not Role.SP
+            misfit = other_unit(is_now, row.point, row.signal) if judged and row.signal is not None else ""
             if was not in {UNKNOWN, is_now}:
                 misfit = f"its {what} is {is_now} now and was {was}; see `loop check`, and start the loop anew"
-            self._judge(name, what, Fault(f"{name}: {misfit}", what, name) if misfit else "")
+            self._judge(row, what, Fault(f"{row.name}: {misfit}", what, row.name) if misfit else "")
 
-    def _judge(self, name: str, what: str, why: str) -> None:
+    def _judge(self, row: Row, what: str, why: str) -> None:
         """The fault of a row begins, lasts, or is over (empty)."""
         if why:
-            self._wrong[name, what] = why
+            self._wrong[row, what] = why
         else:
-            self._wrong.pop((name, what), None)
+            self._wrong.pop((row, what), None)
 
 
 def numbers(ids: Iterable[str]) -> dict[int, str]:
@@ -297,19 +295,6 @@ def others_since(before: Mapping[str, Seen], now: Mapping[str, Seen]) -> list[st
         for what, was, is_now in zip(Seen._fields[1:], before[row][1:], seen[1:], strict=True)
         if UNKNOWN not in {was, is_now} and was != is_now
     ]
-
-
-def measured(row: str) -> bool:
-    """Whether the loop computes with a row's number: neither a node that it writes, nor a wish of the plant's side."""
-    return not (row.endswith(WRITTEN) or row.startswith("SP ") or row == "mode")
-
-
-def signal_of(manifest: Manifest, name: str) -> Signal | None:
-    """The signal of a row such as "PV T" or "MV T_j, written"; None for what is no signal."""
-    group, _, rest = name.partition(" ")
-    rest = rest.removesuffix(WRITTEN)
-    signals = {"PV": manifest.pv, "MV": manifest.mv, "DV": manifest.dv, "SP": manifest.sp}.get(group, ())
-    return next((s for s in signals if s.name == rest), None)
 
 
 def other_unit(unit: str, point: Point, signal: Signal) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
 from typing import TypeAlias
 
 import numpy as np
@@ -10,7 +12,7 @@ from asyncua import ua
 from numpy.typing import NDArray
 
 from serving.errors import EndpointError, LoopError
-from serving.manifest import Manifest
+from serving.manifest import Manifest, Signal
 from serving.opcua.lease import SeveralLeasesError, beside
 from serving.opcua.link import Link
 from serving.opcua.settings import NO_LEASE, Nodes, Point
@@ -20,6 +22,63 @@ from serving.words import first_line
 Array: TypeAlias = NDArray[np.float64]
 
 
+class Role(Enum):
+    """Use of a node by a loop."""
+
+    PV = "PV"
+    MV = "MV"
+    DV = "DV"
+    SP = "SP"
+    MODE = "mode"
+    WATCHDOG = "watchdog"
+    HEARTBEAT = "heartbeat"
+    HAND_BACK = "hand_back"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One node of a loop. ``judged``: a sample is only as good as its value. ``written``: the loop writes it.
+
+    An MV has two rows, which are one node where nothing else is read back.
+    """
+
+    role: Role
+    point: Point
+    signal: Signal | None = None
+    judged: bool = False
+    written: bool = False
+
+    @property
+    def title(self) -> str:
+        """Role and signal, such as "MV T_j"."""
+        return self.role.value if self.signal is None else f"{self.role.value} {self.signal.name}"
+
+    @property
+    def name(self) -> str:
+        """The title; of a node that is written also that."""
+        return f"{self.title}, written" if self.written else self.title
+
+    @property
+    def node(self) -> str:
+        """Its id in loop.toml."""
+        return self.point.node if self.written else self.point.read_back or self.point.node
+
+    @property
+    def wish(self) -> bool:
+        """Whether the plant's own operator asks for something by it."""
+        return self.role in {Role.SP, Role.MODE}
+
+    @property
+    def measured(self) -> bool:
+        """Whether the loop computes with its number."""
+        return not (self.written or self.wish)
+
+    @property
+    def ages(self) -> bool:
+        """Whether its value grows stale: a measurement does, and a value that somebody set is as old as it is."""
+        return self.judged and self.role is not Role.MV
+
+
 class Plan:
     """The nodes of one connection, with the types that they have in it."""
 
@@ -27,22 +86,24 @@ class Plan:
         self.nodes, self.manifest = nodes, manifest
         self.dv_names = [s.name for s in manifest.dv if s.name in nodes.dv]
         pv, mv, dv, sp = (nodes.points(n) for n in ("pv", "mv", "dv", "sp"))
-        used = "dv" in manifest.inputs
-        # (name, how it is scaled, whether the sample is only as good as this value)
-        self.points: list[tuple[str, Point, bool]] = [
-            *((f"PV {s.name}", pv[s.name], True) for s in manifest.pv),
-            *((f"MV {s.name}", mv[s.name], True) for s in manifest.mv),
-            *((f"DV {name}", dv[name], used) for name in self.dv_names),
-            *((f"SP {name}", point, False) for name, point in sp.items()),
+        used, wanted = "dv" in manifest.inputs, {s.name: s for s in manifest.sp}
+        self.rows = [
+            *(Row(Role.PV, pv[s.name], s, judged=True) for s in manifest.pv),
+            *(Row(Role.MV, mv[s.name], s, judged=True) for s in manifest.mv),
+            *(Row(Role.DV, dv[s.name], s, judged=used) for s in manifest.dv if s.name in nodes.dv),
+            *(Row(Role.SP, point, wanted[name]) for name, point in sp.items()),
         ]
-        # A value that somebody set is as old as it is: only measurements grow stale.
-        self.timed = [i for i, (name, _, judged) in enumerate(self.points) if judged and not name.startswith("MV ")]
+        self.timed = [i for i, row in enumerate(self.rows) if row.ages]
         if nodes.mode is not None:
-            self.points.append(("mode", Point(nodes.mode.node), False))
+            self.rows.append(Row(Role.MODE, Point(nodes.mode.node)))
         if nodes.watchdog:
-            self.points.append(("watchdog", Point(nodes.watchdog), False))
-        self.mv_names = [s.name for s in manifest.mv]
-        self.mv_points = [mv[s.name] for s in manifest.mv]
+            self.rows.append(Row(Role.WATCHDOG, Point(nodes.watchdog)))
+        self.outputs = [Row(Role.MV, mv[s.name], s, judged=True, written=True) for s in manifest.mv]
+        self.extra = []
+        if nodes.heartbeat:
+            self.extra.append(Row(Role.HEARTBEAT, Point(nodes.heartbeat), judged=True, written=True))
+        if nodes.hand_back is not None:
+            self.extra.append(Row(Role.HAND_BACK, Point(nodes.hand_back.node), judged=True, written=True))
         self.asked: list[ua.NodeId] = []
         self.written: list[tuple[ua.NodeId, ua.VariantType]] = []
         self.heartbeat: tuple[ua.NodeId, ua.VariantType, int] | None = None
@@ -54,17 +115,13 @@ class Plan:
     async def made(cls, link: Link, manifest: Manifest, nodes: Nodes, timeout_s: float) -> Plan:
         """Ask the server for ids and types."""
         plan = cls(nodes, manifest)
-        texts = [p.read_back or p.node for _, p, _ in plan.points]
-        others = {"heartbeat": nodes.heartbeat, "hand_back": "" if nodes.hand_back is None else nodes.hand_back.node}
-        extra = [name for name, node in others.items() if node]
-        ids = await link.resolved(
-            [*texts, *(p.node for p in plan.mv_points), *(others[name] for name in extra)], timeout_s
-        )
-        names = [*(f"MV {n}" for n in plan.mv_names), *extra]
-        shared = shared_node(names, ids[len(texts) :])
+        written = [*plan.outputs, *plan.extra]
+        n, n_mv = len(plan.rows), len(plan.outputs)
+        ids = await link.resolved([row.node for row in (*plan.rows, *written)], timeout_s)
+        shared = shared_node(written, ids[n:])
         if shared:
             raise LoopError(shared)
-        plan.asked, targets = ids[: len(texts)], ids[len(texts) : len(texts) + len(plan.mv_points)]
+        plan.asked, targets = ids[:n], ids[n : n + n_mv]
         if nodes.lease == NO_LEASE:
             plan.lease = None
         elif nodes.lease:
@@ -75,12 +132,12 @@ class Plan:
             except SeveralLeasesError as error:
                 plan.unwritable = f"lease: {first_line(error)}"
         plan.asked += [plan.lease] if plan.lease is not None else []
-        kinds = [r.kind for r in await link.read(ids[len(texts) :], timeout_s)]
-        for name, kind in zip(names, kinds, strict=True):
+        kinds = [r.kind for r in await link.read(ids[n:], timeout_s)]
+        for row, kind in zip(written, kinds, strict=True):
             if kind in {None, ua.VariantType.Null}:  # the node is not there now, or holds nothing yet
-                raise EndpointError(f"{name}: the server gives no value, so its type is not known")
-        typed = [(i, k) for i, k in zip(ids[len(texts) :], kinds, strict=True) if k is not None]
-        plan.written, rest = typed[: len(plan.mv_points)], typed[len(plan.mv_points) :]
+                raise EndpointError(f"{row.title}: the server gives no value, so its type is not known")
+        typed = [(i, k) for i, k in zip(ids[n:], kinds, strict=True) if k is not None]
+        plan.written, rest = typed[:n_mv], typed[n_mv:]
         if nodes.heartbeat:
             (node, kind), *rest = rest
             plan.beat_in(node, kind)
@@ -88,12 +145,14 @@ class Plan:
             plan._hand_back = rest[0]
         return plan
 
-    def measuring(self) -> list[tuple[str, Point, ua.NodeId]]:
-        """The nodes whose numbers the loop uses, by name and scale: what is read for it, and the MVs that it writes."""
-        read = [(n, p, at) for (n, p, judged), at in zip(self.points, self.asked, strict=False)
-                if (judged or n.startswith("SP "))]  # fmt: skip
-        written = zip(self.mv_names, self.mv_points, self.written, strict=True)
-        return [*read, *((f"MV {n}, written", p, at) for n, p, (at, _) in written)]
+    def measuring(self) -> list[tuple[Row, ua.NodeId]]:
+        """The nodes whose numbers the loop uses: those that are read for it, and the MVs that it writes."""
+        read = zip(self.rows, self.asked, strict=False)
+        written = zip(self.outputs, self.written, strict=True)
+        return [
+            *((row, at) for row, at in read if row.judged or row.role is Role.SP),
+            *((row, at) for row, (at, _) in written),
+        ]
 
     def beat_in(self, node: ua.NodeId, kind: ua.VariantType) -> None:
         """Count the heartbeat in this type of its node."""
@@ -102,8 +161,9 @@ class Plan:
     def variants(self, mv: Array) -> list[tuple[ua.NodeId, ua.Variant]]:
         """Values to write for an MV (n_mv,): raw numbers in the nodes' own types, within the range."""
         rows = []
-        signals = zip(self.written, self.mv_points, self.manifest.mv, mv.tolist(), strict=True)
-        for (node, kind), point, s, value in signals:
+        signals = zip(self.written, self.outputs, self.manifest.mv, mv.tolist(), strict=True)
+        for (node, kind), row, s, value in signals:
+            point = row.point
             low, high = sorted(((s.low - point.offset) / point.scale, (s.high - point.offset) / point.scale))
             raw = min(max((value - point.offset) / point.scale, low), high)
             rows.append((node, variant(raw, kind, low, high)))
@@ -117,10 +177,10 @@ class Plan:
         return node, exact(value, kind)
 
 
-def shared_node(names: Sequence[str], ids: Sequence[ua.NodeId]) -> str:
+def shared_node(rows: Sequence[Row], ids: Sequence[ua.NodeId]) -> str:
     """Why nodes cannot be written: that of an MV is that of something else, too. Empty: each has its own."""
-    for i, name in enumerate(names):
-        others = [n for k, n in enumerate(names) if k != i and ids[k] == ids[i]]
-        if others and name.startswith("MV "):
-            return f"{name} and {', '.join(others)} are one node, {ids[i].to_string()}; give each its own"
+    for i, row in enumerate(rows):
+        others = [other.title for k, other in enumerate(rows) if k != i and ids[k] == ids[i]]
+        if others and row.role is Role.MV:
+            return f"{row.title} and {', '.join(others)} are one node, {ids[i].to_string()}; give each its own"
     return ""

@@ -13,7 +13,7 @@ from serving.fault import Fault
 from serving.manifest import Manifest
 from serving.opcua.ages import Ages
 from serving.opcua.nameplates import Nameplates
-from serving.opcua.plan import Plan
+from serving.opcua.plan import Plan, Role, Row
 from serving.opcua.settings import Nodes, Server
 from serving.opcua.values import BAD, GOOD, UNCERTAIN, Reading
 
@@ -58,27 +58,27 @@ class Sampling:
     ) -> Values:
         """Values that arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not arrive."""
         fault, typed, found, unheard = "", "", dict[str, float](), dict[str, str]()
-        for (name, point, judged), answer in zip(plan.points, answers, strict=False):
+        for row, answer in zip(plan.rows, answers, strict=False):
+            name, point = row.name, row.point
             usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
             # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
             # is a read-back, which says where the MV stands also while a PV is bad.
-            told = usable or (judged and not name.startswith("MV "))
+            told = usable or row.ages
             found[name] = point.scale * answer.number + point.offset if told else np.nan
-            wish = name == "mode" or name.startswith("SP ")
-            if usable and not answer.text and (judged or wish):
-                changed = self.nameplates.typed(name, answer.kind)
-                changed = changed or (self.nameplates.wrong.get(name, "") if wish else "")
+            if usable and not answer.text and (row.judged or row.wish):
+                changed = self.nameplates.typed(row, answer.kind)
+                changed = changed or (self.nameplates.wrong.get(name, "") if row.wish else "")
                 if changed:  # another number: no PV to be shown, no place of the MV, no wish
                     found[name] = np.nan
-                    if wish:
+                    if row.wish:
                         unheard[name] = changed
-                    typed = typed or ("" if wish else changed)
-            if fault or not judged:
+                    typed = typed or ("" if row.wish else changed)
+            if fault or not row.judged:
                 continue
             if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
                 fault = Fault(f"{name}: {answer.words}", f"quality {answer.words}", name)
             elif answer.text:
-                fault = Fault(f"{name}: {_given(name, answer.text)}", "number", name)
+                fault = Fault(f"{name}: {_given(row, answer.text)}", "number", name)
         judge = self.server.source_time == "judge"
         timed = ages.update(arrived_s, [answers[i].source_s if judge else None for i in plan.timed])
         m = self.manifest
@@ -101,7 +101,7 @@ class Sampling:
             tuple(a.status for a in answers[:n]),
             asked_sp,
             mode,
-            {plan.points[i][0]: age for i, age in zip(plan.timed, timed, strict=True)},
+            {plan.rows[i].name: age for i, age in zip(plan.timed, timed, strict=True)},
             starts,
             unheard,
         )
@@ -125,7 +125,7 @@ class Sampling:
         return self._dead
 
 
-def _given(name: str, text: str) -> str:
+def _given(row: Row, text: str) -> str:
     """The kind of a value that is no number; of NaN and infinity also who gives it."""
-    by = "read-back" if name.startswith("MV ") else "sensor"
+    by = "read-back" if row.role is Role.MV else "sensor"
     return f"{text}: the {by} gives no number" if text in NO_NUMBERS else text

@@ -195,7 +195,7 @@ def _check(options: argparse.Namespace) -> int:
     rows = inspection.rows
     if not here.runs:
         here.tried(lambda: require_free(settings, inspection.identity))
-    names = [f.name for f in fields(Found) if f.name not in {"wrong", "note", "passing"}]
+    names = [f.name for f in fields(Found) if f.name not in {"wrong", "note", "passing", "written"}]
     table = [names, *([getattr(row, name) for name in names] for row in rows)]
     widths = [max(len(line[i]) for line in table) for i in range(len(names))]
     for cells in table:

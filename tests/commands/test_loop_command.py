@@ -22,6 +22,7 @@ from serving import Controller, LoopError, Signal
 from serving.journal import Journal
 from serving.opcua.inspection import _refused, _unfit, inspected
 from serving.opcua.nameplates import other_unit
+from serving.opcua.plan import Role, Row
 from serving.opcua.settings import Point
 from serving.station.command import JOURNAL_LOST
 from serving.station.lease import Lease
@@ -297,13 +298,13 @@ def test_check_agrees_with_the_guards_on_a_pv_beyond_its_range(
 
 
 def test_no_guard_looks_at_the_value_of_a_dv_a_set_point_or_a_node_that_is_written() -> None:
-    signal = Signal("x", "K", 0.0, 100.0)
-    refused = [
-        name for name in ("PV x", "MV x", "MV x, written", "DV x", "SP x") if _refused(name, signal, 110.0, 0.05)
-    ]
+    signal, point = Signal("x", "K", 0.0, 100.0), Point("n")
+    rows = [Row(role, point, signal) for role in (Role.PV, Role.MV, Role.DV, Role.SP)]
+    rows.append(Row(Role.MV, point, signal, written=True))
+    refused = [row.name for row in rows if _refused(row, signal, 110.0, 0.05)]
     assert refused == ["PV x", "MV x"]
-    assert not _refused("MV x", signal, 101.9, 0.05)
-    assert _refused("MV x", signal, 102.1, 0.05)
+    assert not _refused(rows[1], signal, 101.9, 0.05)
+    assert _refused(rows[1], signal, 102.1, 0.05)
 
 
 @pytest.mark.parametrize(

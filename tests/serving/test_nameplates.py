@@ -176,7 +176,7 @@ def test_what_a_number_stood_for_outlives_the_loop(manifest: Manifest, tmp_path:
 def valued(made: Nameplates, plan: Plan, **kinds: ua.VariantType) -> Values:
     """The values of a reading in which some nodes have another type."""
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
-    answers = [Reading(1.0, 0, None, kinds.get(name.replace(" ", "_"), DOUBLE)) for name, _, _ in plan.points]
+    answers = [Reading(1.0, 0, None, kinds.get(row.name.replace(" ", "_"), DOUBLE)) for row in plan.rows]
     sampling = Sampling(made.manifest, server, made.nodes, made)
     return sampling.valued(plan, answers, Ages(len(plan.timed)), 0.0, unbeaten="", starts=0)
 
@@ -252,7 +252,7 @@ def test_a_node_that_is_declared_to_hold_any_number_may_hold_any(declared: int, 
     made = Nameplates(nodes_of(manifest, "ns=2"), manifest)
     plan = connected(link, made)
     valued(made, plan)
-    whole = dict.fromkeys((name.replace(" ", "_") for name, _, _ in plan.points), INT32)
+    whole = dict.fromkeys((row.name.replace(" ", "_") for row in plan.rows), INT32)
     assert (valued(made, plan, **whole).fault, valued(made, plan, **whole).unheard) == ("", {})
     assert valued(made, plan, PV_level=ua.VariantType.Boolean).fault.startswith("PV level: its type is Boolean now")
     link.kinds["valve"] = INT32

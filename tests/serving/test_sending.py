@@ -46,7 +46,7 @@ class Plant:
 
     def sends(self) -> None:
         """What waits goes out."""
-        plan: Any = SimpleNamespace(variants=list, hand_back=lambda: "owner", lease=None, mv_names=["valve"])
+        plan: Any = SimpleNamespace(variants=list, hand_back=lambda: "owner", lease=None)
         asyncio.run(self.endpoint._send(self, plan))  # type: ignore[arg-type]
 
     async def write(self, rows: list[Any], _: float) -> list[int]:
