@@ -74,6 +74,10 @@ class Groundwork(ABC, Generic[Result_co]):
     def done(self, source: Source, label: str) -> Result_co:
         """The result; ``label`` names its progress. Raises ModelError without the needed data."""
 
+    def plainer(self, found: Any) -> Any:
+        """The result with a simpler model, for a record that does not prove the one of ``found``; None without one."""
+        return None
+
 
 @dataclass(frozen=True)
 class Learnt:

@@ -19,11 +19,18 @@ from pipeline.engine.command import run_stage
 from pipeline.engine.parallel import parallel_map
 from pipeline.errors import ParamsError
 from pipeline.evaluation.case import Case
+from pipeline.evaluation.proof import sign_doubts
 from pipeline.files import write_json
 from pipeline.models import MODELS, Part, Source
 from pipeline.models.part import Groundwork, done, groundworks
 from pipeline.records.record import Record
 from pipeline.stages.paths import model_folder
+
+Shared = Mapping[int, Mapping[Groundwork[Any], Any]]
+"""Data seed -> groundwork -> its result."""
+
+Results = Mapping[tuple[int, str], tuple[str | None, dict[str, Any], Mapping[str, Any] | None]]
+"""(data seed, part) -> digest of its record, figures, predictions."""
 
 
 def fit(name: str) -> None:
@@ -37,6 +44,32 @@ def fit(name: str) -> None:
     label = f"fit {name}"
     needed = groundworks(parts.values())
     shared = {seed: done(needed, _source(data, case, seed), label) for seed in data if needed}
+    results = _all(parts, data, case, shared, folder, label)
+    plain = _plainer(shared)
+    if case.on_models and plain is not None and _unproven(parts, results):
+        apart = folder / "plainer"
+        again = _all(parts, data, case, plain, apart, f"{label}, linear, as the network is not proven")
+        if not _unproven(parts, again):
+            results = again
+            shutil.copytree(apart, folder, dirs_exist_ok=True)
+        shutil.rmtree(apart)
+    digests = {str(seed): results[seed, next(iter(parts))][0] for seed in data}
+    write_json(folder / "metrics.json", {"model": params.model, "data": digests, "parts": _figures(parts, results)})
+    for part in parts if 0 in data else ():
+        predictions = results[0, part][2]
+        if predictions is not None:
+            np.savez(folder / "predictions.npz", **predictions)
+
+
+def _all(
+    parts: Mapping[str, Part],
+    data: Mapping[int, Path | None],
+    case: Case,
+    shared: Shared,
+    folder: Path,
+    label: str,
+) -> Results:
+    """Every part of every data seed, learnt and saved in ``folder``."""
     work = [(seed, part) for seed in data for part in parts]
     learnt = parallel_map(
         partial(_learn, parts, data, case, shared, folder),
@@ -44,18 +77,33 @@ def fit(name: str) -> None:
         f"{label}: the models, their errors and their bands",
         in_folder=True,
     )
-    results = dict(zip(work, learnt, strict=True))
-    digests = {str(seed): digest for (seed, _), (digest, _, _) in results.items()}
-    metrics: dict[str, Any] = {"model": params.model, "data": digests, "parts": {}}
+    return dict(zip(work, learnt, strict=True))
+
+
+def _plainer(shared: Shared) -> Shared | None:
+    """Groundwork with simpler models wherever there is one; None where there is none at all."""
+    found = {seed: {work: work.plainer(result) for work, result in of.items()} for seed, of in shared.items()}
+    if not any(plain is not None for of in found.values() for plain in of.values()):
+        return None
+    return {
+        seed: {work: shared[seed][work] if plain is None else plain for work, plain in of.items()}
+        for seed, of in found.items()
+    }
+
+
+def _unproven(parts: Mapping[str, Part], results: Results) -> bool:
+    """Whether no controller of these models could be shipped, as the record does not prove their gains."""
+    return bool(sign_doubts({"": {"parts": _figures(parts, results)}}))
+
+
+def _figures(parts: Mapping[str, Part], results: Results) -> dict[str, Any]:
+    """Each part's figures, by data seed and their median."""
+    found = {}
     for part, description in parts.items():
-        per_seed = {str(seed): results[seed, part][1] for seed in data}
+        per_seed = {str(seed): figures for (seed, name), (_, figures, _) in results.items() if name == part}
         fields = {k: getattr(description, k) for k in ("task", "horizon") if hasattr(description, k)}
-        own = {"per_seed": per_seed, "median": _median(per_seed)}
-        metrics["parts"][part] = {"kind": description.model.kind, **fields, **own}
-        predictions = results[0, part][2] if 0 in data else None
-        if predictions is not None:
-            np.savez(folder / "predictions.npz", **predictions)
-    write_json(folder / "metrics.json", metrics)
+        found[part] = {"kind": description.model.kind, **fields, "per_seed": per_seed, "median": _median(per_seed)}
+    return found
 
 
 def parts_of(params: ModelParams, where: str) -> dict[str, Part]:
@@ -88,7 +136,7 @@ def _learn(
     parts: Mapping[str, Part],
     data: Mapping[int, Path | None],
     case: Case,
-    shared: Mapping[int, Mapping[Groundwork[Any], Any]],
+    shared: Shared,
     folder: Path,
     item: tuple[int, str],
 ) -> tuple[str | None, dict[str, Any], Mapping[str, Any] | None]:

@@ -54,6 +54,7 @@ class Selection:
     innovations: float | None = None  # nats by which one-step errors prefer the network; None: free runs judged
     farthest: float = FARTHEST  # scaled: where rests of a network may lie
     dead_times: Sequence[tuple[int, int]] = ()  # [periods] least and most of each input that explain the rows alike
+    refused: bool = False  # whether the record does not prove the network's gains: the linear model takes its place
 
     @property
     def nonlinear(self) -> bool:
@@ -62,7 +63,7 @@ class Selection:
         In a record that drifts the seeds differ by what each took for drift, so that ``GAIN`` alone decides. Noise is
         nearly all of one-step errors, and their log-likelihood decides.
         """
-        if self.network is None:
+        if self.network is None or self.refused:
             return False
         if self.network.against != self.linear.against:  # what is known of the plant decides before any error
             return self.network.against < self.linear.against

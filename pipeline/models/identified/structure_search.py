@@ -67,3 +67,9 @@ class StructureSearch(Groundwork[Searched]):
         return Searched(
             replace(problem, settles=selection.settles, farthest=selection.farthest), selection, scales, beside
         )
+
+    def plainer(self, found: Searched) -> Searched | None:
+        """The linear model in the network's place: it may be proven where the network bends by what is not the MVs'."""
+        if not found.selection.nonlinear:
+            return None
+        return replace(found, selection=replace(found.selection, refused=True))
