@@ -59,6 +59,9 @@ def tell(
         sizes = ", ".join(f"{mv} by up to {axis_label(f'{size:.3g}', unit)} to each side" for mv, unit, size in moved)
         print(f"{folder}/step_test.csv is the step test to run: {len(test.start_s)} steps, {takes}; "
               f"it moves {sizes}{test.reading}")  # fmt: skip
+        if not all(i.certain for i in report.verdict.inputs if i.role == "mv"):
+            print("  end a step where a PV nears an end of its range in the record, and go on with the next one: "
+                  "a PV that does not rest by itself, such as a level, would run on")  # fmt: skip
 
 
 def sayings(verdict: Verdict, units: Mapping[str, str], known: Collection[Known] = ()) -> list[str]:

@@ -63,9 +63,10 @@ def step_responses_picture(evidence: Evidence) -> Canvas:
     for row, cv in zip(panels, cvs, strict=True):
         for axes, signal in zip(row, inputs, strict=True):
             found = responses[cv.name][signal.name]
-            # A response begins at 0 where the input moves.
-            time, words = time_axis(plant.period_s * np.array([0, *found["periods"]], dtype=np.float64))
-            middle, low, high = (np.array([0.0, *found[key]]) for key in ("middle", "low", "high"))
+            # A response begins at 0 where the input moves, and is 0 up to the period before its first point.
+            periods = [0, found["periods"][0] - 1, *found["periods"]]
+            time, words = time_axis(plant.period_s * np.array(periods, dtype=np.float64))
+            middle, low, high = (np.array([0.0, 0.0, *found[key]]) for key in ("middle", "low", "high"))
             axes.fill_between(time, low, high, color=LAW, alpha=0.25, linewidth=0, label="band of all good fits")
             axes.plot(time, middle, color=LAW, linewidth=1.4, label="their middle")
             axes.axhline(0.0, color="#888888", linewidth=0.7)

@@ -25,7 +25,7 @@ from pipeline.report.own_acceptance import step_test_to_run
 from pipeline.report.templating import REGISTRY_URL, render, write_pages
 from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
 from pipeline.report.worse import against, beyond_reach, shipped_laws
-from pipeline.tuning.pid_forms import PidForms
+from pipeline.tuning.pid_forms import PidForms, whole_span
 from pipeline.tuning.rules import PidSettings
 
 MOST_HEADLINES = 5
@@ -237,7 +237,8 @@ def _old_controllers(evidence: Evidence) -> list[str]:
         return words
     if evidence.case.stand_in == IDENTIFIED and not grounds.operated:
         return ["it is not known, as no set point of the record is named (`--sp` of `loopwright new`)"]
-    spans = {s.name: s.high - s.low for s in (*evidence.case.record_signals.pv, *evidence.case.record_signals.mv)}
+    signals = evidence.case.record_signals
+    spans = {s.name: s.high - s.low for s in signals.pv} | {s.name: whole_span(s) for s in signals.mv}
     for law in grounds.old_controllers:
         forms = ""
         if law.believed and law.pv in spans and law.mv in spans:

@@ -6,6 +6,17 @@ from dataclasses import dataclass
 from math import isfinite, sqrt
 
 from pipeline.tuning.rules import PidSettings
+from serving.manifest import Signal
+
+PERCENT = 100.0  # whole range of an MV in %
+
+
+def whole_span(mv: Signal) -> float:
+    """Range of an actuator [mv] that a proportional band counts by.
+
+    A control system scales an MV in % from 0 to 100, whatever part of it a record moved or a law may command.
+    """
+    return PERCENT if mv.unit == "%" else mv.high - mv.low
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.tuning.pid_forms import PidForms
+from pipeline.tuning.pid_forms import PidForms, whole_span
 from pipeline.tuning.rules import PidSettings
+from serving.manifest import Signal
 
 S = 1j * np.geomspace(1e-4, 10, 30)  # [1/s]
 
@@ -38,3 +39,8 @@ def test_without_an_integral_part_there_is_no_time_of_it() -> None:
     assert forms.ki == 0
     assert forms.series == (2.0, float("inf"), 10.0)
     assert "no integral part" in forms.words("degC", "%")
+
+
+def test_a_band_counts_by_all_of_a_valve_in_percent_and_by_the_range_of_another_unit() -> None:
+    assert whole_span(Signal("OP", "%", 25.0, 58.0)) == 100
+    assert whole_span(Signal("FIC.SP", "t/h", 10.0, 60.0)) == 50

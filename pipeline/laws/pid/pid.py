@@ -23,7 +23,7 @@ from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 from pipeline.tuning.loop_search import Loops
 from pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, choice_words, pairings
-from pipeline.tuning.pid_forms import PidForms
+from pipeline.tuning.pid_forms import PidForms, whole_span
 from pipeline.tuning.responses import StepResponses
 from pipeline.tuning.rules import AllPole, PidSettings
 from pipeline.tuning.stability import FrozenLoops, spectral_radius
@@ -262,7 +262,7 @@ class PID(ControlLaw):
             cv, mv = self.signals.sp[i], self.signals.mv[j]
             integral = f"Ti {s.ti_s:.4g} s" if isfinite(s.ti_s) else "no integral part"
             derivative = f"Td {s.td_s:.4g} s with a filter of {s.filter_s:.4g} s" if s.td_s else "no derivative"
-            forms = PidForms.of(s, cv.high - cv.low, mv.high - mv.low)
+            forms = PidForms.of(s, cv.high - cv.low, whole_span(mv))
             words.append(
                 f"{mv.name} by {cv.name}: Kc {s.kc:.4g} {mv.unit}/({cv.unit}), {integral}, {derivative}, set-point "
                 f"weight {s.set_point_weight:.4g}, anti-windup within {s.tracking_time_s:.4g} s "

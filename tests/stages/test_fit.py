@@ -1,0 +1,88 @@
+"""An own plant takes the linear model where its record refuses the network and proves that one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import pytest
+
+from pipeline.models.identified.selection import Selection
+from pipeline.models.identified.structure_search import Searched, StructureSearch
+from pipeline.models.part import Groundwork, Learnt, Part, Source, done
+from pipeline.stages.fit import _proven_if_possible
+
+
+@dataclass
+class Saved:
+    what: str
+    kind: ClassVar[str] = "identified"
+
+    def save(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(self.what)
+
+
+@dataclass(frozen=True)
+class Search(Groundwork[str]):
+    kind: str = "identified"
+
+    def done(self, source: Source, label: str) -> str:
+        return "network"
+
+    def plainer(self, found: str) -> str | None:
+        return "linear" if found == "network" else None
+
+
+def answer(sign: float) -> dict[str, Any]:
+    """Certain in sign, or of another one in one-step predictions."""
+    found = {"model": 1.0, "low": 0.8, "high": 1.2, "first": 1, "last": 5, "direct": sign, "sd": 0.1}
+    return {**found, "verdict": "proven" if sign > 0 else "opposite", "follows": 0.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Learns(Part):
+    model: ClassVar[Any] = Saved
+    proven: tuple[str, ...] = ()
+
+    def groundwork(self) -> Search:
+        return Search()
+
+    def learn(self, source: Source) -> Learnt:
+        what = source.result(self.groundwork())
+        proof = {"answers": {"y": {"u": answer(1.0 if what in self.proven else -1.0)}}}
+        return Learnt(Saved(what), {"what": what, "proof": proof})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("proven", "on_models", "taken"),
+    [
+        (("network", "linear"), True, "network"),
+        (("linear",), True, "linear"),
+        ((), True, "network"),  # neither: the better one stays, and the refusal is about it
+        (("linear",), False, "network"),  # laws of the papers' cases are tried on the plant itself
+    ],
+)
+def test_the_plainer_model_is_taken_where_the_record_proves_it_alone(
+    proven: tuple[str, ...], on_models: bool, taken: str, tmp_path: Path
+) -> None:
+    part = Learns(proven=proven)
+    plant = SimpleNamespace(signals=None)
+    case: Any = SimpleNamespace(on_models=on_models, plant=plant, regions={}, known=(), held={})
+    shared = {0: done([part.groundwork()], Source(None, None), "")}  # type: ignore[arg-type]
+    results = _proven_if_possible({"identified": part}, {0: None}, case, shared, tmp_path, "fit")
+    assert results[0, "identified"][1]["what"] == taken
+    assert (tmp_path / "seed0" / "identified.npz").read_text() == taken
+    assert not (tmp_path / "plainer").exists()
+
+
+def test_a_network_that_is_refused_leaves_the_choice_to_the_linear_model() -> None:
+    trials: Any = [SimpleNamespace(against=frozenset(), error=error) for error in (1.0, 0.5)]
+    found = Selection(*trials, [], 0.0, settles=True, drifts=False, innovations=50.0)
+    search = StructureSearch("identified", False, None, True, (4,), None, None, 8000)
+    plain = search.plainer(Searched(None, found, None))  # type: ignore[arg-type]
+    assert plain is not None
+    assert (found.chosen, plain.selection.chosen) == (trials[1], trials[0])
+    assert search.plainer(plain) is None
