@@ -41,7 +41,7 @@ ATTRIBUTE = re.compile(
 CONTROL_VARIABLE = re.compile(r"[ ._:/-]cv$", re.IGNORECASE)
 FLOW = re.compile(
     r"flow|flu(ss|ß)|(zu|ab|aus|ein)lauf|durchsatz|feed|discharge|throughput|d[ée]bit|caudal|portata"
-    r"|^f[a-z]{0,3}[ _-]?[0-9]",
+    r"|(^|[ ._:/-])[0-9]{0,3}f[a-z]{0,3}[ _-]?[0-9]",
     re.IGNORECASE,
 )
 FLOW_UNIT = re.compile(
@@ -75,7 +75,8 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
     """One guess for every column, in the order of the file."""
     found = [_guess(s, units.get(name, "")) for name, s in export.series.items()]
     found = [_mode_of(_output(g, found), found, export.series[g.tag.tag]) for g in found]
-    found = _flows_without_loop([_cascaded(g, found) for g in found])
+    named = {g.tag.tag for g in found if g.tag.role == "pv" and not _is_flow(g)}
+    found = _without_loop([_cascaded(g, found) for g in found])
     if not any(g.tag.role == "mv" for g in found):  # names say nothing: what moves in steps may be one
         moved = [g for g in found if not g.tag.role and g.look is Look.STEPS]
         moved = [g for g in moved if not _is_flow(g)] or moved  # a feed that others set, where a valve is there
@@ -87,8 +88,8 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
         own = [g for g in free if g.tag.tag in loops] or [g for g in free if not _is_flow(g)][:1] or free[:1]
         found = [g.as_role("pv") if g in own else g for g in found]
     # A variable that looks like a PV and answers to nothing may drift as the PVs do: no guess makes it a cause of them.
-    taken = {g.tag.tag for g in found if g.tag.role == "pv"}
-    return [_with_loop(g) for g in disturbances(without_answers(found, export), export, taken)]
+    taken = named | {g.tag.tag for g in found if g.tag.role == "pv"}
+    return _modes_of_blocks([_with_loop(g) for g in disturbances(without_answers(found, export), export, taken)])
 
 
 def _parameter(tag: str) -> str:
@@ -108,6 +109,17 @@ def _with_loop(guess: Guess) -> Guess:
     return guess if role in {"", "dv"} else replace(guess, tag=replace(guess.tag, loop=loop_of(guess.tag.tag)))
 
 
+def _modes_of_blocks(found: Sequence[Guess]) -> list[Guess]:
+    """The guesses, a mode of a whole module with the one loop within it, as FIC1/MODE with FIC1/PID1/OUT."""
+    loops = {g.tag.loop for g in found if g.tag.role in {"pv", "mv", "sp"} and g.tag.loop}
+    changed = []
+    for g in found:
+        inner = [loop for loop in loops if re.match(re.escape(g.tag.loop) + r"[ ._:/-]", loop)]
+        alone = g.tag.role == "mode" and g.tag.loop and g.tag.loop not in loops and len(inner) == 1
+        changed.append(replace(g, tag=replace(g.tag, loop=inner[0])) if alone else g)
+    return changed
+
+
 def loop_in(tag: Tag) -> str:
     """The loop that a tag belongs to: as a person said, else by its name; empty where it belongs to none."""
     return "" if tag.loop == NO_LOOP else tag.loop or loop_of(tag.tag)
@@ -121,17 +133,25 @@ def _is_flow(guess: Guess) -> bool:
     return unit in {"", "%", "-", "1"} and bool(FLOW.search(guess.tag.tag)) and not NO_FLOW.search(guess.tag.tag)
 
 
-def _flows_without_loop(found: Sequence[Guess]) -> list[Guess]:
-    """The guesses, flows that no loop holds without a role, where another PV is there.
+def _without_loop(found: Sequence[Guess]) -> list[Guess]:
+    """The guesses, variables that no loop holds without a role, where another PV is there.
 
-    An outflow through an MV's valve follows the MV, and a feed disturbs: neither is what a controller shall hold.
+    An outflow through an MV's valve follows the MV, and a feed disturbs: neither is what a controller shall hold. Nor
+    is any other variable, where some PV has a loop and there are more PVs than MVs to hold them.
     """
     held = {loop for g in found if g.tag.role in {"sp", "mv", "mode"} and (loop := loop_of(g.tag.tag))}
-    alone = [g for g in found if g.tag.role == "pv" and _is_flow(g) and (loop_of(g.tag.tag) or g.tag.tag) not in held]
-    if all(g in alone for g in found if g.tag.role == "pv"):
+    pvs, n_mv = [g for g in found if g.tag.role == "pv"], sum(g.tag.role == "mv" for g in found)
+    alone = [g for g in pvs if (loop_of(g.tag.tag) or g.tag.tag) not in held]
+    if len(alone) == len(pvs) or len(pvs) <= n_mv:
+        alone = [g for g in alone if _is_flow(g)]
+    if len(alone) == len(pvs):
         return list(found)
-    note = "a flow without a loop of its own: role pv if it is to be controlled"
-    return [g.as_role("", note) if g in alone else g for g in found]
+    notes = {
+        g.tag.tag: f"a {'flow' if _is_flow(g) else 'variable'} without a loop of its own: role pv if it is to be "
+        "controlled, dv if it disturbs"
+        for g in alone
+    }
+    return [g.as_role("", notes[g.tag.tag]) if g.tag.tag in notes else g for g in found]
 
 
 def _output(guess: Guess, found: Sequence[Guess]) -> Guess:

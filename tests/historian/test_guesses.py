@@ -165,3 +165,18 @@ def test_a_cv_beside_an_output_is_no_output(tmp_path: Path) -> None:
     found = roles(tmp_path / "export.csv", dict(zip(heads, ("level", "level", "valve", "sp"), strict=True)))
     assert found["LV-1.OP"] == "mv"
     assert found["LIC-1.CV"] != "mv"
+
+
+def test_a_variable_without_a_loop_is_not_controlled_where_others_have_one(tmp_path: Path) -> None:
+    heads = {"LIC-1.PV": "level", "LIC-1.OP": "valve", "LIC-1.SP": "sp", "PDT7.PV": "whole", "33FT07.PV": "in"}
+    assert list(roles(tmp_path / "one.csv", heads).values()) == ["pv", "mv", "sp", "", "dv"]
+    # As many MVs as PVs: each may be held, whatever its tag is called.
+    heads = {"LIC-1.PV": "level", "LIC-1.OP": "valve", "LIC-1.SP": "sp", "PT7.PV": "out", "V2.OP": "in"}
+    assert roles(tmp_path / "two.csv", heads)["PT7.PV"] == "pv"
+
+
+def test_the_mode_of_a_module_belongs_to_the_loop_within_it(tmp_path: Path) -> None:
+    data = {"FIC1/PID1/PV.CV": "level", "FIC1/PID1/OUT.CV": "valve", "FIC1/PID1/SP.CV": "sp", "FIC1/MODE.CV": "mode"}
+    roles(tmp_path / "block.csv", data)
+    found = guesses(read_export([tmp_path / "block.csv"]), {})
+    assert {g.tag.role: g.tag.loop for g in found} == dict.fromkeys(("pv", "mv", "sp", "mode"), "FIC1/PID1")
