@@ -126,7 +126,7 @@ class OwnCase(OwnEnsemble):
         )
 
     def scenarios(self) -> dict[str, tuple[Scenario, ...]]:
-        """Set points on the other models; the same on the law's, spoilt; loads; and steps of the measured disturbances.
+        """Set points on the other models; the same on spoilt ones; loads; and steps of the measured disturbances.
 
         There is a load on each CV, upwards and downwards, which no controller sees, where MVs can hold it.
         Each measured disturbance that moves in the record steps upwards and downwards too.
@@ -146,12 +146,11 @@ class OwnCase(OwnEnsemble):
     @cached_property
     def _scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         members, pairs = self.members, self._pairs
-        # A member is a draw of these errors itself: with two standard deviations more it stands for no likely plant.
-        own = self._nominal
-        spoilt = [self._spoilt(own, s, of) for (s, _), of in zip(pairs, cycle(errors_of(own)), strict=False)]
+        errors = errors_of(self._nominal)
+        spoilt = [self._spoilt(p, s, of) for (s, p), of in zip(pairs, cycle(errors), strict=False)]
         upwards = [(p, up) for (_, p), up in zip(pairs, cycle((True, False)), strict=False)]
         less = sorted({share for _, share in spoilt if share < 1})
-        title = f"Set points, on the law's model gone wrong: {self._doubts}"
+        title = f"Set points, on such models gone wrong: {self._doubts}"
         if less:
             count = sum(share < 1 for _, share in spoilt)
             title += (

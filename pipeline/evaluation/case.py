@@ -306,6 +306,10 @@ class Case(ABC):
 
     def developed(self, errors: Sequence[float]) -> float:
         """The mean of a law's errors over the development sequences, nan of none; see ``development_geometric``."""
-        if not self.development_geometric or not errors:
+        if not errors or not self.development_geometric:
             return statistics.fmean(errors) if errors else math.nan
-        return statistics.geometric_mean(errors) if min(errors) > 0 else 0.0
+        # An error of none counts as the least of the others: no sequence decides alone.
+        least = min((error for error in errors if error > 0), default=0.0)
+        if not least:
+            return sum(errors)
+        return float(np.exp(np.log(np.maximum(errors, least)).mean()))

@@ -81,7 +81,7 @@ class Cycle:
 class LawMetrics:
     """metrics.json of one law, ``controllers.<case>-<name>``; this class alone writes and reads it.
 
-    ``development``: data seed -> mean error over the development sequences, in the case's ``metric``;
+    ``development``: data seed -> error over the development sequences (``Case.developed``);
     ``locked_up``: test -> data seed -> closed loops that got stuck, of those where any did; ``as_printed``: a
     reproduction of a paper's law; ``sequences``: test -> seed of a sequence -> medians over the data seeds;
     ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its

@@ -97,10 +97,13 @@ def _left_open(part: Mapping[str, Any], mvs: Sequence[str]) -> tuple[str, ...]:
     if not found:
         return ()
     gains = ", ".join(f"{_by(sd)} in the gain of {name}" for name, sd in zip(mvs, found["gain_sd"], strict=True))
-    dead = found["dead_sd"][0]
+    dead, pace = found["dead_sd"][0], _by(found["pace_sd"][0])
+    if any(least < most for _, least, most in (found.get("dead_times") or {}).values()):
+        later = f"; some answer up to {2 * dead:.2g} periods later" if dead > 0 else ""
+        return (f"Models as likely as this one differ by {gains} and by {pace} in speed (standard deviations){later}.",)
     return (
-        f"Models as likely as this one differ by {gains}, by {_by(found['pace_sd'][0])} in speed and by {dead:.2g} "
-        "periods in dead time (standard deviations).",
+        f"Models as likely as this one differ by {gains}, by {pace} in speed and by {dead:.2g} periods in dead time "
+        "(standard deviations).",
     )
 
 

@@ -16,7 +16,7 @@ def whole_span(mv: Signal) -> float:
 
     A control system scales an MV in % from 0 to 100, whatever part of it a record moved or a law may command.
     """
-    return PERCENT if mv.unit == "%" else mv.high - mv.low
+    return max(PERCENT, mv.high - mv.low) if mv.unit == "%" else mv.high - mv.low
 
 
 @dataclass(frozen=True, slots=True)

@@ -126,6 +126,8 @@ async def _inspected(
         else:
             found.append(Found("lease", "-", note="" if nodes.lease == NO_LEASE else NO_LEASE_NOTE))
         targets = [(row, a.at) for row in rows if row.written and isinstance(a := asked[row.node], _Asked)]
+        if lease and isinstance(at := asked[lease], _Asked):
+            targets.append((Row(Role.LEASE, Point(lease), written=True), at.at))
         shared = shared_node([row for row, _ in targets], [at for _, at in targets])
         found += [Found("nodes, written", "-", wrong=shared, written=True)] if shared else []
         found += _namespaces(nodes, await link.namespaces(server.connect_s), spaces)

@@ -33,6 +33,7 @@ class Role(Enum):
     WATCHDOG = "watchdog"
     HEARTBEAT = "heartbeat"
     HAND_BACK = "hand_back"
+    LEASE = "lease"
 
 
 @dataclass(frozen=True, slots=True)

@@ -86,12 +86,9 @@ def test_it_stands_after_the_cases_of_the_papers(heater: OwnCase) -> None:
 
 
 def test_no_test_runs_on_the_law_s_own_model(heater: OwnCase) -> None:
-    """As it is: gone wrong it is a plant that the record allows, and a member gone wrong would be wrong twice."""
-    tests = dict(heater.tests())
-    gone_wrong = tests.pop("spoilt")
-    assert {id(t.plant) for of in tests.values() for t in of} == {id(plant) for plant in heater.members}
-    assert all(t.plant is heater.plant for t in gone_wrong)
-    assert all(t.changes["gain_TIC-101.OP"][0] != 1 or t.changes["dead_time"][0] > 1 for t in gone_wrong)
+    tests = [test for sequences in heater.tests().values() for test in sequences]
+    assert all(test.plant is not None and test.plant is not heater.plant for test in tests)
+    assert {id(test.plant) for test in tests} == {id(plant) for plant in heater.members}
     assert all(test.plant is heater.plant for test in heater.development())
 
 
@@ -100,7 +97,8 @@ def test_no_development_sequence_decides_alone_however_large_its_errors_are(heat
     for size in (1.0, 1e3):
         assert heater.developed([1.0] * 4 + [2 * size]) < heater.developed([2.0] * 4 + [size])
     assert np.isnan(heater.developed([]))
-    assert heater.developed([0.0, 1.0]) == 0
+    assert np.isnan(heater.developed([np.nan, 1.0]))
+    assert heater.developed([0.0, 1.0]) > 0
     assert all_cases()["batch_reactor"].developed([1.0, 5.0]) == 3  # of the papers' cases the plain mean
 
 

@@ -36,41 +36,48 @@ class Search(Groundwork[str]):
         return "linear" if found == "network" else None
 
 
-def answer(sign: float) -> dict[str, Any]:
-    """Certain in sign, or of another one in one-step predictions."""
-    found = {"model": 1.0, "low": 0.8, "high": 1.2, "first": 1, "last": 5, "direct": sign, "sd": 0.1}
-    return {**found, "verdict": "proven" if sign > 0 else "opposite", "follows": 0.0}
+def answer(sign: float, *regions: float) -> dict[str, Any]:
+    """Certain in sign, or of another one in one-step predictions; with regions of such gains, where they turn."""
+    found = {"model": 1.0, "low": 0.8, "high": 1.2, "first": 1, "last": 5, "direct": sign, "sd": 0.1, "follows": 0.0}
+    found["verdict"] = "proven" if sign > 0 else "opposite"
+    told = [{**found, "from": 0.0, "to": 1.0, "small": False, "model": gain} for gain in regions]
+    return {**found, "regions": told, **({"verdict": "turns"} if told else {})}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Learns(Part):
     model: ClassVar[Any] = Saved
     proven: tuple[str, ...] = ()
+    turns: bool = False
 
     def groundwork(self) -> Search:
         return Search()
 
     def learn(self, source: Source) -> Learnt:
         what = source.result(self.groundwork())
-        proof = {"answers": {"y": {"u": answer(1.0 if what in self.proven else -1.0)}}}
+        regions = (1.0, -1.0) if self.turns and what == "network" else ()
+        proof = {"answers": {"y": {"u": answer(1.0 if what in self.proven else -1.0, *regions)}}}
         return Learnt(Saved(what), {"what": what, "proof": proof})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("proven", "on_models", "taken"),
+    ("proven", "of_case", "turns", "taken"),
     [
-        (("network", "linear"), True, "network"),
-        (("linear",), True, "linear"),
-        ((), True, "network"),  # neither: the better one stays, and the refusal is about it
-        (("linear",), False, "network"),  # laws of the papers' cases are tried on the plant itself
+        (("network", "linear"), {}, False, "network"),
+        (("linear",), {}, False, "linear"),
+        ((), {}, False, "network"),  # neither: the better one stays, and the refusal is about it
+        (("linear",), {}, True, "network"),  # a straight model would hide the turn
+        (("linear",), {"on_models": False}, False, "network"),  # laws are tried on the plant itself
+        (("linear",), {"stand_in": "simulator"}, False, "network"),
     ],
 )
 def test_the_plainer_model_is_taken_where_the_record_proves_it_alone(
-    proven: tuple[str, ...], on_models: bool, taken: str, tmp_path: Path
+    proven: tuple[str, ...], of_case: dict[str, Any], turns: bool, taken: str, tmp_path: Path
 ) -> None:
-    part = Learns(proven=proven)
+    part = Learns(proven=proven, turns=turns)
     plant = SimpleNamespace(signals=None)
-    case: Any = SimpleNamespace(on_models=on_models, plant=plant, regions={}, known=(), held={})
+    own = {"on_models": True, "stand_in": "identified", "plant": plant, "regions": {}, "known": (), "held": {}}
+    case: Any = SimpleNamespace(**own | of_case)
     shared = {0: done([part.groundwork()], Source(None, None), "")}  # type: ignore[arg-type]
     results = _proven_if_possible({"identified": part}, {0: None}, case, shared, tmp_path, "fit")
     assert results[0, "identified"][1]["what"] == taken

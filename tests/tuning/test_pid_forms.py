@@ -43,4 +43,5 @@ def test_without_an_integral_part_there_is_no_time_of_it() -> None:
 
 def test_a_band_counts_by_all_of_a_valve_in_percent_and_by_the_range_of_another_unit() -> None:
     assert whole_span(Signal("OP", "%", 25.0, 58.0)) == 100
+    assert whole_span(Signal("OP", "%", -100.0, 100.0)) == 200
     assert whole_span(Signal("FIC.SP", "t/h", 10.0, 60.0)) == 50

@@ -151,7 +151,9 @@ class IdentifiedPart(Part):
         unused = unused_answers(controlled, np.median(curves, axis=0) / size[:, None, None], structure, (n_cv, n_mv))
         margin = sign_margin(controlled, unused, LIKELY_SDS) if n_mv > 1 else -np.inf
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
-        dead = np.array([_later(selection, n_mv)]) if selection.dead_times else doubt.dead
+        # Where no dead time but the model's explains the record, nothing is known of others: the curves tell.
+        compared = any(least < most for least, most in selection.dead_times)
+        dead = np.array([_later(selection, n_mv)]) if compared else doubt.dead
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": dead}
         known = {"noise": noise, "colour": colour, "load_moves": _load_moves(fitted.model, whole), **open_to}
         model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)

@@ -50,9 +50,7 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
     if network is None:
         words = "linear is enough: its residual is as small as the noise, or no network could be trained"
     elif selection.refused:
-        words = (
-            "linear: a network errs less over held-out rows, but the record does not prove its gains, and proves these"
-        )
+        words = "linear: a network was chosen first, but the record does not prove its gains, and proves these"
     elif selection.innovations is not None and not selection.nonlinear:
         words = (
             "linear: one row ahead no network is better by enough to count; a record in closed loop often does not "
