@@ -42,7 +42,12 @@ TESTS = ("pipeline.evaluation", "pipeline.simulation.scenario")
 # Stage -> what it imports without a part in its result: by whom ("" is anybody), and what, with all that is in it.
 APART = {
     "excite": {("", what) for what in (*TESTS, "serving.manifest")},
-    "fit": {("", what) for what in (*TESTS, "serving.manifest")},
+    "fit": {
+        *(("", what) for what in ("pipeline.simulation.scenario", "serving.manifest")),
+        *((who, "pipeline.evaluation") for who in ("pipeline.cases", "pipeline.models", "pipeline.pictures")),
+        # A fit asks whether the record proves its model: the words of that have no part in the answer.
+        *(("pipeline.stages", "pipeline.evaluation.case"), ("pipeline.evaluation", "pipeline.evaluation.validation")),
+    },
     "design": {
         *(("", what) for what in TESTS),
         # What trained the models has had its effect.
