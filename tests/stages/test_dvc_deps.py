@@ -56,7 +56,7 @@ def test_nothing_is_missing_but_what_is_named_as_apart(stage: str, case: str) ->
         ("fit", "ph_neutralization_15s", "pipeline/cases/ph_neutralization/plant.py", True),
         ("fit", "thiosulfate_cstr", "pipeline/models/static/rbf.py", True),
         ("fit", "thiosulfate_cstr", "pipeline/evaluation/case.py", False),
-        ("fit", "batch_reactor", "pipeline/evaluation/proof.py", True),  # whether a linear model takes a network's place
+        ("fit", "batch_reactor", "pipeline/evaluation/proof.py", True),  # chooses between two models
         ("design", "thiosulfate_cstr", "pipeline/laws/pid/pid.py", True),
         ("design", "thiosulfate_cstr", "pipeline/export/graph.py", True),
         ("design", "thiosulfate_cstr", "pipeline/metrics.py", False),
