@@ -76,7 +76,7 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
     found = [_guess(s, units.get(name, "")) for name, s in export.series.items()]
     found = [_mode_of(_output(g, found), found, export.series[g.tag.tag]) for g in found]
     named = {g.tag.tag for g in found if g.tag.role == "pv" and not _is_flow(g)}
-    found = _without_loop([_cascaded(g, found) for g in found])
+    found = _without_loop([_cascaded(g, found) for g in found], flows=True)
     if not any(g.tag.role == "mv" for g in found):  # names say nothing: what moves in steps may be one
         moved = [g for g in found if not g.tag.role and g.look is Look.STEPS]
         moved = [g for g in moved if not _is_flow(g)] or moved  # a feed that others set, where a valve is there
@@ -88,8 +88,9 @@ def guesses(export: Export, units: Mapping[str, str]) -> list[Guess]:
         own = [g for g in free if g.tag.tag in loops] or [g for g in free if not _is_flow(g)][:1] or free[:1]
         found = [g.as_role("pv") if g in own else g for g in found]
     # A variable that looks like a PV and answers to nothing may drift as the PVs do: no guess makes it a cause of them.
+    answering = without_answers(found, export)
     taken = named | {g.tag.tag for g in found if g.tag.role == "pv"}
-    return _modes_of_blocks([_with_loop(g) for g in disturbances(without_answers(found, export), export, taken)])
+    return _modes_of_blocks([_with_loop(g) for g in disturbances(_without_loop(answering), export, taken)])
 
 
 def _parameter(tag: str) -> str:
@@ -133,8 +134,8 @@ def _is_flow(guess: Guess) -> bool:
     return unit in {"", "%", "-", "1"} and bool(FLOW.search(guess.tag.tag)) and not NO_FLOW.search(guess.tag.tag)
 
 
-def _without_loop(found: Sequence[Guess]) -> list[Guess]:
-    """The guesses, variables that no loop holds without a role, where another PV is there.
+def _without_loop(found: Sequence[Guess], *, flows: bool = False) -> list[Guess]:
+    """The guesses, variables (or ``flows`` alone) that no loop holds without a role, where another PV is there.
 
     An outflow through an MV's valve follows the MV, and a feed disturbs: neither is what a controller shall hold. Nor
     is any other variable, where some PV has a loop and there are more PVs than MVs to hold them.
@@ -142,7 +143,7 @@ def _without_loop(found: Sequence[Guess]) -> list[Guess]:
     held = {loop for g in found if g.tag.role in {"sp", "mv", "mode"} and (loop := loop_of(g.tag.tag))}
     pvs, n_mv = [g for g in found if g.tag.role == "pv"], sum(g.tag.role == "mv" for g in found)
     alone = [g for g in pvs if (loop_of(g.tag.tag) or g.tag.tag) not in held]
-    if len(alone) == len(pvs) or len(pvs) <= n_mv:
+    if flows or len(alone) == len(pvs) or len(pvs) <= n_mv:
         alone = [g for g in alone if _is_flow(g)]
     if len(alone) == len(pvs):
         return list(found)

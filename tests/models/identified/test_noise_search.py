@@ -158,5 +158,7 @@ def test_likely_dead_times_hold_the_one_of_the_plant(seed: int) -> None:
     assert own == found["structure"]["delays"][0]
     assert low <= own <= high
     assert low - 1 <= loop.dead - 1 <= high + 1
-    assert 2 * found["open"]["dead_sd"][0] == high - own  # an earlier one makes no plant of the tests late
+    later = 2 * found["open"]["dead_sd"][0]
+    # An earlier one makes no plant of the tests late; where none but the model's is likely, the answers' spread tells.
+    assert later == high - own if low < high else 0 <= later < 2
     assert own > 5  # before, the least of a few: 0, 5, 3 and 0 of four records
