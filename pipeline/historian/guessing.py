@@ -41,7 +41,7 @@ ATTRIBUTE = re.compile(
 CONTROL_VARIABLE = re.compile(r"[ ._:/-]cv$", re.IGNORECASE)
 FLOW = re.compile(
     r"flow|flu(ss|ß)|(zu|ab|aus|ein)lauf|durchsatz|feed|discharge|throughput|d[ée]bit|caudal|portata"
-    r"|(^|[ ._:/-])[0-9]{0,3}f[a-z]{0,3}[ _-]?[0-9]",
+    r"|^([0-9]{1,3}[ ._:/-]?)?f[a-z]{0,3}[ _-]?[0-9]",
     re.IGNORECASE,
 )
 FLOW_UNIT = re.compile(
@@ -147,12 +147,8 @@ def _without_loop(found: Sequence[Guess], *, flows: bool = False) -> list[Guess]
         alone = [g for g in alone if _is_flow(g)]
     if len(alone) == len(pvs):
         return list(found)
-    notes = {
-        g.tag.tag: f"a {'flow' if _is_flow(g) else 'variable'} without a loop of its own: role pv if it is to be "
-        "controlled, dv if it disturbs"
-        for g in alone
-    }
-    return [g.as_role("", notes[g.tag.tag]) if g.tag.tag in notes else g for g in found]
+    note = "without a loop of its own: role pv if it is to be controlled, dv if it disturbs"
+    return [g.as_role("", f"a {'flow' if _is_flow(g) else 'variable'} {note}") if g in alone else g for g in found]
 
 
 def _output(guess: Guess, found: Sequence[Guess]) -> Guess:

@@ -89,7 +89,7 @@ class Signer:
 
 
 def present(tags: Mapping[str, str]) -> dict[str, str]:
-    """Those tags of a version that say who signed it; nothing where nobody did."""
+    """Tags of a version that say who signed it; nothing where nobody did."""
     return {name: tags[name] for name in (BY, FINGERPRINT, UNTIL) if name in tags}
 
 

@@ -85,13 +85,13 @@ class Plan:
 
     def __init__(self, nodes: Nodes, manifest: Manifest) -> None:
         self.nodes, self.manifest = nodes, manifest
-        self.dv_names = [s.name for s in manifest.dv if s.name in nodes.dv]
+        self.dvs = [s for s in manifest.dv if s.name in nodes.dv]
         pv, mv, dv, sp = (nodes.points(n) for n in ("pv", "mv", "dv", "sp"))
         used, wanted = "dv" in manifest.inputs, {s.name: s for s in manifest.sp}
         self.rows = [
             *(Row(Role.PV, pv[s.name], s, judged=True) for s in manifest.pv),
             *(Row(Role.MV, mv[s.name], s, judged=True) for s in manifest.mv),
-            *(Row(Role.DV, dv[s.name], s, judged=used) for s in manifest.dv if s.name in nodes.dv),
+            *(Row(Role.DV, dv[s.name], s, judged=used) for s in self.dvs),
             *(Row(Role.SP, point, wanted[name]) for name, point in sp.items()),
         ]
         self.timed = [i for i, row in enumerate(self.rows) if row.ages]

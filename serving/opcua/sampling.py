@@ -90,7 +90,7 @@ class Sampling:
         if self.nodes.watchdog and not fault:
             fault = self.dead(found["watchdog"])
         fault = fault or typed or self.nameplates.fault or unbeaten
-        n = len(m.pv) + len(m.mv) + len(plan.dv_names)
+        n = len(m.pv) + len(m.mv) + len(plan.dvs)
         return Values(
             arrived_s,
             np.array([found[f"PV {s.name}"] for s in m.pv]),

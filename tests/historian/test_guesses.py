@@ -71,7 +71,7 @@ def test_a_flow_is_told_in_many_ways(flow: str, tmp_path: Path) -> None:
     assert list(found.values()) == ["", "pv", "mv"]
 
 
-@pytest.mark.parametrize("head", ["F101 Temp", "F1-T [degC]", "Flow box level", "FI-7 [bar]"])
+@pytest.mark.parametrize("head", ["F101 Temp", "F1-T [degC]", "Flow box level", "FI-7 [bar]", "TI-F12.PV", "33TI07.PV"])
 def test_another_quantity_is_no_flow(head: str, tmp_path: Path) -> None:
     found = roles(tmp_path / "export.csv", {head: "level", "LC": "out", "valve": "valve"})
     assert found[head.partition(" [")[0]] == "pv"
