@@ -137,8 +137,9 @@ def fitted(record: Record, order: int, units: int, seed: int = 0) -> Identified:
     left = residuals(network.model, network.starts, train)
     assert left is not None
     known = {"noise": noise_of(left), "colour": np.zeros(n_y), **dict.fromkeys(("pace_sd", "dead_sd"), np.zeros(1))}
-    known["gain_sd"] = np.zeros(n_y)
-    return assembled(network.model, [0] * data.v.shape[1], scales, data, known, n_y, seed)
+    n_v = data.v.shape[1]
+    known |= {"gain_sd": np.zeros(n_y), **dict.fromkeys(("dv_noise", "dv_change"), np.zeros(n_v - n_y))}
+    return assembled(network.model, [0] * n_v, scales, data, known, n_y, seed)
 
 
 def courses(plant: Plant, seed: int) -> tuple[Array, Array]:

@@ -11,8 +11,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from closed_plant import ClosedPlant
@@ -23,7 +24,7 @@ from torch import Tensor
 
 from pipeline.commands import new
 from pipeline.commands.new_exported import asked, given_tags
-from pipeline.evaluation.proof import sign_doubts
+from pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
 from pipeline.historian.exported import screened_export, with_units
 from pipeline.historian.guessing import controlled_first
 from pipeline.historian.refusal import refusal
@@ -31,6 +32,7 @@ from pipeline.historian.tags import named
 from pipeline.laws import LAWS
 from pipeline.models.identified.identified import Identified
 from pipeline.models.identified.identified_part import IdentifiedPart
+from pipeline.models.identified.structure_search import Searched
 from pipeline.models.part import Source
 from pipeline.plants.signals import Signals
 from pipeline.records.record import Record
@@ -128,11 +130,26 @@ def read(file: Path, options: Sequence[str]) -> Read:
 def fitted(found: Read, minutes: float | None = None) -> tuple[Identified, str]:
     """The model of a record as stage `fit` makes it with all defaults, and what its proof holds against it.
 
-    ``minutes`` is the budget of its search; None: the default.
+    The linear model takes the place of a network that the record does not prove, as there. ``minutes`` is the budget
+    of the search; None: the default.
     """
-    learnt = IdentifiedPart(minutes=minutes).learn(Source(found.record, found.signals, held=found.held))
+    part, source = IdentifiedPart(minutes=minutes), Source(found.record, found.signals, held=found.held)
+    work = part.groundwork()
+    searched = work.done(source, work.kind)
+    model, metrics = _learnt(part, source, searched)
+    doubts, plain = sign_doubts(metrics), work.plainer(searched)
+    if not doubts or plain is None or turns(metrics):
+        return model, doubts
+    other, metrics = _learnt(part, source, plain)
+    return (model, doubts) if sign_doubts(metrics) or fit_doubts(metrics) else (other, "")
+
+
+def _learnt(part: IdentifiedPart, source: Source, searched: Searched) -> tuple[Identified, dict[str, Any]]:
+    """The model of a search, and the figures of its set as those who judge the proof read them."""
+    learnt = part.learn(replace(source, groundwork={part.groundwork(): searched}))
+    assert isinstance(learnt.model, Identified)
     parts = {"identified": {"kind": "identified", "per_seed": {"0": learnt.metrics}}}
-    return learnt.model, sign_doubts({"": {"parts": parts}})
+    return learnt.model, {"": {"parts": parts}}
 
 
 def by_fit(plant: ClosedPlant, file: Path) -> Delivered:

@@ -97,12 +97,13 @@ class OwnEnsemble(Case):
                 arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
                 colour, doubts = np.asarray(file["colour"]), Doubts.of(file)
                 noise = deviation(file["noise"] * file["y_scale"], colour)
+                dv_noise = file["dv_noise"] * file["v_scale"][len(signals.mv) :]
         except (OSError, ValueError, KeyError, EOFError, BadZipFile):
             raise ModelError(f"{path} is damaged, or no identified model; remove it, and run its fit stage") from None
         dv = np.median(self.record.dv, axis=0)
         most = int(np.ceil(max(doubts.dead, self._doubts.dead)))
         plant = OwnPlant(signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
-        plant.noise, plant.colour, plant.doubts = noise, colour, doubts
+        plant.noise, plant.dv_noise, plant.colour, plant.doubts = noise, dv_noise, colour, doubts
         return plant
 
     @cached_property

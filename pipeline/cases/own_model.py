@@ -52,6 +52,7 @@ class OwnPlant(IdentifiedPlant):
     """A model of an own plant, with the measurement noise of its record and the errors that the record leaves open."""
 
     noise: Array
+    dv_noise: Array
     colour: Array
     doubts: Doubts
     rest: tuple[Array, Array] | None = None
@@ -88,6 +89,11 @@ class OwnPlant(IdentifiedPlant):
         return self.colour
 
     @property
+    def dv_noise_std(self) -> Array:
+        """Standard deviation of the noise of the measured disturbances, shape (n_dv,)."""
+        return self.dv_noise
+
+    @property
     def start(self) -> tuple[Array, Array]:
         """(state (n_x,), mv (n_mv,)) of a rest."""
         return super().start if self.rest is None else (self.rest[0].copy(), self.rest[1].copy())
@@ -97,7 +103,8 @@ class OwnPlant(IdentifiedPlant):
         other = type(self)(
             self.signals, self.arrays, name=self.name, mv=mv, dv=self.dv_nominal, most_dead_time=self.most_dead_time
         )
-        other.noise, other.colour, other.doubts, other.rest = self.noise, self.colour, self.doubts, (x, mv)
+        other.noise, other.dv_noise, other.colour = self.noise, self.dv_noise, self.colour
+        other.doubts, other.rest = self.doubts, (x, mv)
         return other
 
     def variations(self) -> tuple[Simulator, ...]:

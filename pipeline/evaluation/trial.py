@@ -17,7 +17,7 @@ from pipeline.evaluation.metric import mean_of_draws
 from pipeline.plants.identified import IdentifiedPlant
 from pipeline.plants.simulator import Array
 from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import Trajectory, simulate_closed
+from pipeline.simulation.simulate import DV_DRAW, Trajectory, disturbance_noise, simulate_closed
 from serving.controller import Controller
 from serving.errors import LoopwrightError
 
@@ -95,10 +95,13 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
 def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
     """One closed loop; an extra entry of info is 1 if the controller refused the step.
 
-    The MV then stays at its last value, as in the real loop's HOLD.
+    The MV then stays at its last value, as in the real loop's HOLD. With noise, measured disturbances have theirs.
     """
     plant, state = test.plant or case.plant, controller.cold_state()
-    measured = iter(test.disturbances(plant))
+    disturbances = test.disturbances(plant)
+    if noise is not None:
+        disturbances = disturbances + disturbance_noise(plant, test.samples, np.random.default_rng([seed, DV_DRAW]))
+    measured = iter(disturbances)
     n_info = len(controller.manifest.info)
 
     def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, tuple[float, ...]]:

@@ -1,10 +1,14 @@
-"""Measurement noise with a colour."""
+"""Measurement noise: its colour, and how it is told from what a signal does."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline.plants.simulator import Array
+
+CERTAIN = 3.0  # standard errors by which the changes of a signal turn back before that is called noise
 
 
 def deviation(white: Array, colour: Array) -> Array:
@@ -26,3 +30,36 @@ def coloured(white: Array, colour: Array) -> Array:
     for k in range(1, len(found)):
         found[k] = colour * found[k - 1] + fresh * white[k]
     return found
+
+
+def noise_and_change(stretches: Sequence[Array]) -> tuple[Array, Array]:
+    """Standard deviations (n,) of the white noise of signals (rows, n), and of their own change from row to row.
+
+        s(k) = d(k) + n(k),   c_j = mean of Ds(k) Ds(k+j),   var n = c_2 - c_1,   var Dd = c_0 - 2 var n
+
+    with the differences D from row to row. Noise makes each change turn back in the next one; what a signal does by
+    itself goes on, or has nothing to do with its last change. No noise is seen in it where the changes turn back by no
+    more than ``CERTAIN`` standard errors.
+    """
+    changes = [np.diff(s, axis=0) for s in stretches if len(s) > 4]
+    width = stretches[0].shape[1] if stretches else 0
+    if not changes:
+        return np.zeros(width), np.zeros(width)
+    most = np.concatenate([c**2 for c in changes]).mean(axis=0)
+    turned = np.concatenate([c[:-2] * (c[2:] - c[1:-1]) for c in changes])
+    noise, error = turned.mean(axis=0), turned.std(axis=0) / np.sqrt(len(turned))
+    noise = np.where(noise > CERTAIN * error, np.minimum(noise, most / 2), 0.0)
+    return np.sqrt(noise), np.sqrt(np.maximum(most - 2 * noise, 0.0))
+
+
+def level_gain(noise: Array, change: Array) -> Array:
+    """Gain K (n,) with which the level of a signal is followed best: d(k) = d(k-1) + K (s(k) - d(k-1)).
+
+        K = (q + sqrt(q^2 + 4 q)) / (q + sqrt(q^2 + 4 q) + 2),   q = (change / noise)^2
+
+    The steady Kalman filter of a random walk in white noise (Anderson and Moore, Optimal Filtering, 1979, ch. 4), which
+    is 1 without noise: the signal is taken as it is.
+    """
+    q = np.where(noise > 0, change, 1.0) ** 2 / np.where(noise > 0, noise, 1.0) ** 2
+    root = q + np.sqrt(q**2 + 4 * q)
+    return np.where(noise > 0, root / (root + 2), 1.0)

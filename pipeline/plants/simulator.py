@@ -82,6 +82,11 @@ class Simulator(ABC):
         return np.zeros(len(self.pv_signals))
 
     @property
+    def dv_noise_std(self) -> Array:
+        """Standard deviation (n_dv,) of the white noise of the measured disturbances."""
+        return np.zeros(len(self.dv_signals))
+
+    @property
     def foreseen(self) -> int | None:
         """Samples after a move over which its answer is known; None: all."""
         return None

@@ -58,6 +58,11 @@ class SpoiltPlant(Simulator):
         """Colour of the measurement noise, shape (n_pv,)."""
         return self.plant.noise_colour
 
+    @property
+    def dv_noise_std(self) -> Array:
+        """Standard deviation of the noise of the measured disturbances, shape (n_dv,)."""
+        return self.plant.dv_noise_std
+
     def parameter_names(self) -> tuple[str, ...]:  # type: ignore[override]
         """Names of the plant's parameters."""
         return self.plant.parameter_names()

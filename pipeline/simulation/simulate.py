@@ -15,6 +15,8 @@ from pipeline.plants.noise import coloured
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.simulation.scenario import Scenario
 
+DV_DRAW = 1  # beside the seed of a loop: the noise of its measured disturbances is drawn by itself
+
 Step = Callable[[Array, Array, Array], tuple[ArrayLike, ArrayLike]]
 """One step of a controller: (sp (n_sp,), pv (n_pv,), mv_applied (n_mv,)) -> (mv, info); it may keep a state."""
 
@@ -111,6 +113,11 @@ def noise_draws(plant: Simulator, n: int, noise: Sequence[float] | Array | None,
             f"plant {plant.name!r}: noise is {list(noise)}; give one standard deviation >= 0 for each of {names}"
         )
     return coloured(rng.standard_normal((n, len(names))), plant.noise_colour) * std
+
+
+def disturbance_noise(plant: Simulator, n: int, rng: np.random.Generator, size: float = 1.0) -> Array:
+    """Noise (n, n_dv) of the measured disturbances, ``size`` times the plant's ``dv_noise_std``, white."""
+    return size * plant.dv_noise_std * rng.standard_normal((n, len(plant.dv_signals)))
 
 
 def _checked(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:

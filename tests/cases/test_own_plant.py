@@ -52,6 +52,7 @@ def model(pole: float) -> dict[str, np.ndarray]:
         "v_scale": np.array([50.0]),
         "noise": np.array([0.01]),
         **{name: np.zeros(1) for name in ("colour", "gain_sd", "pace_sd", "dead_sd")},
+        **{name: np.zeros(0) for name in ("dv_noise", "dv_change")},
         "rest": np.array([[1.0, 0.0, 0.0]]),
     }
 
@@ -204,7 +205,7 @@ def test_an_mv_that_acts_after_many_periods_is_seen_to_act(heater: OwnCase) -> N
     of = OwnPlant(
         plant.signals, replace(plant.arrays, **equation, rest=np.array([[1.0, 0.0, 0.0], *[[0.0, 1.0, 0.0]] * 70]))
     )
-    of.noise, of.colour = plant.noise, plant.colour
+    of.noise, of.dv_noise, of.colour = plant.noise, plant.dv_noise, plant.colour
     assert of.foreseen == MOST_PERIODS + 70
     process = StepResponses.near_start(of).process(0, 0)
     assert process.dead_time_s == pytest.approx(700.0, rel=0.02)

@@ -37,6 +37,7 @@ def model(pole: float) -> dict[str, np.ndarray]:
         "v_scale": np.array([40.0, 200.0]),
         "noise": np.array([0.01]),
         **{name: np.zeros(1) for name in ("colour", "gain_sd", "pace_sd", "dead_sd")},
+        **{name: np.zeros(0) for name in ("dv_noise", "dv_change")},
         "rest": np.array([[1.0, 0.0, 0.0, 0.0]]),
     }
 

@@ -407,6 +407,48 @@ def test_of_numbers_that_err_nearly_the_same_the_calmest_are_taken() -> None:
     assert calmest(made) is made[1]
 
 
+def noisy_disturbance(noise: float, change: float = 0.05) -> Identified:
+    """A lag whose measured disturbance has noise."""
+    model = first_order(disturbance=1.5)
+    model.dv_noise.fill_(noise)
+    model.dv_change.fill_(change)
+    return model
+
+
+def test_noise_of_a_measured_disturbance_moves_the_mv_less_by_its_level() -> None:
+    """MVs on set point under noise of the disturbance alone; a step of it is still met, a few periods later."""
+    noise, travel, last = 0.2 * np.random.default_rng(0).normal(size=300), [], []
+    for model in (noisy_disturbance(0.0), noisy_disturbance(0.2)):
+        law = law_of(model)
+        x, mv, state, moves = row(0.0), row(0.0), torch.zeros(law.n_state).double(), []
+        for k in range(300):
+            dv = row(0.4 if k >= 60 else 0.0)
+            mv, state, _ = law(row(0.0), x, dv + noise[k], mv, state)
+            x = model(torch.cat([x, mv, dv]))
+            moves.append(float(mv))
+        travel.append(float(np.abs(np.diff(moves[:60])).sum()))
+        last.append(moves[-200:])
+    assert travel[1] < 0.4 * travel[0]
+    assert np.mean(last[1]) == pytest.approx(-0.3, abs=0.06)  # 1.5 * .4 / 2 against it
+
+
+def test_a_disturbance_without_noise_needs_no_level() -> None:
+    """A state more with noise alone."""
+    plain, noisy = (law_of(noisy_disturbance(noise)) for noise in (0.0, 0.2))
+    assert noisy.n_state == plain.n_state + 1
+    assert "level" not in plain.kept
+
+
+def test_the_noise_of_disturbances_is_in_the_trials() -> None:
+    quiet, noisy = (Trials.draw(noisy_disturbance(sd), made_signals(n_dv=1), 15, seed=0) for sd in (0.0, 0.2))
+    assert not quiet.dv_noise.any()
+    assert float(noisy.dv_noise.std()) == pytest.approx(0.2, rel=0.1)
+    assert torch.equal(quiet.noise, noisy.noise)
+    laws = law_of(noisy_disturbance(0.2))
+    moved = [float(trials.run(side_by_side([laws]), 1).travel.sum()) for trials in (quiet, noisy)]
+    assert moved[1] > 1.05 * moved[0]
+
+
 def test_the_loads_of_a_record_go_on_in_the_loops() -> None:
     """From nothing, elsewhere in each loop, beside steps at the MVs; without a record nothing of it is there."""
     model, moves = first_order(), 0.01 * np.random.default_rng(0).normal(size=(3_000, 1))

@@ -13,7 +13,7 @@ from pipeline.evaluation.case import Case
 from pipeline.evaluation.stress.faults import Fault, draw_fault
 from pipeline.plants.simulator import Array, Simulator
 from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import noise_draws
+from pipeline.simulation.simulate import DV_DRAW, disturbance_noise, noise_draws
 
 NOISE = (0.5, 2.0)  # times the case's measurement noise
 LATE = 0.5  # share of the loops with one more sample of dead time
@@ -40,6 +40,11 @@ class Draw:
         """The measurement noise (n, n_pv)."""
         rng = np.random.default_rng(self.noise_seed)
         return noise_draws(plant, self.scenario.samples, self.noise * std, rng)
+
+    def dv_deviation(self, plant: Simulator) -> Array:
+        """The noise (n, n_dv) of the measured disturbances."""
+        rng = np.random.default_rng((*self.noise_seed, DV_DRAW))
+        return disturbance_noise(plant, self.scenario.samples, rng, self.noise)
 
     def quantities(self) -> dict[str, float]:
         """All that was drawn as numbers, by the words of the report."""

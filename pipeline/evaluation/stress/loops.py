@@ -90,6 +90,7 @@ class Stress:
         sp = np.stack([t.sp for t in tests], axis=1)
         dv = np.stack([t.disturbances(plant) for t in tests], axis=1)
         noise = np.stack([d.deviation(plant, std) for d in draws], axis=1)
+        measured = dv + np.stack([d.dv_deviation(plant) for d in draws], axis=1)
         known = [t.parameters(plant) for t in tests]
         mv0, x = np.stack([t.mv0 for t in tests]), np.stack([t.x0 for t in tests])
         law, advance = ControllerRows(self.controller, n), advance_rows(plant, n)
@@ -99,7 +100,7 @@ class Stress:
         xs, refused = np.empty((samples, *x.shape)), np.zeros((samples, n), dtype=bool)
         for k in range(samples):
             xs[k], pvs[k] = x, plant.measured(x)
-            step = law.step(sp=sp[k], pv=pvs[k] + noise[k], dv=dv[k], mv_applied=readback, state=state)
+            step = law.step(sp=sp[k], pv=pvs[k] + noise[k], dv=measured[k], mv_applied=readback, state=state)
             refused[k] = step.refused
             command = np.where(step.refused[:, None], readback, step.mv)
             state = np.where(step.refused[:, None], 0.0, step.state)

@@ -26,6 +26,7 @@ from pipeline.models.affine_map import AffineMap
 from pipeline.models.base import Model
 from pipeline.models.identified.identified import Identified
 from pipeline.models.memory import Named
+from pipeline.plants.noise import level_gain
 from pipeline.plants.signals import Signals
 from pipeline.plants.simulator import Simulator
 
@@ -38,12 +39,12 @@ class Predictive(ControlLaw):
         mv   =  the first move of z
 
     y(1) .. y(N) is the free run of the identified model from x under the plan z, with the estimated loads d and the
-    measured disturbances as they are. The loads make the predictions right on average, so a constant error of the
-    model or a load leaves no offset; a set point out of reach ends at the nearest output. The last plan, one sample
-    on, is where the next one begins. The filter reads the MV that really acted: that is the anti-windup. Without a
-    past it starts at the rest that fits the process variables and the applied MV, under the loads that hold it there:
-    on set point it asks for that MV. The set points r stay as they are, or go on with their last slope. CVs may have
-    soft limits, whose cost is added.
+    measured disturbances as they are; of one with noise, with its level, which follows it by ``level_gain``. The loads
+    make the predictions right on average, so a constant error of the model or a load leaves no offset; a set point out
+    of reach ends at the nearest output. The last plan, one sample on, is where the next one begins. The filter reads
+    the MV that really acted: that is the anti-windup. Without a past it starts at the rest that fits the process
+    variables and the applied MV, under the loads that hold it there: on set point it asks for that MV. The set points r
+    stay as they are, or go on with their last slope. CVs may have soft limits, whose cost is added.
 
     ``Observer``, ``Horizon``, ``Planner``, ``SetPoints`` and ``SoftLimits`` hold the formulas and their sources.
     """
@@ -65,6 +66,7 @@ class Predictive(ControlLaw):
     y_center: Tensor  # (n_cv,)
     y_scale: Tensor  # (n_cv,)
     largest: Tensor  # (n_d,) scaled load of a rest
+    follow: Tensor  # (n_dv,) of the level of each measured disturbance
     load_scale: Tensor  # [mv] of loads at MVs, [pv a period] of loads at outputs; of a scaled load
 
     def __init__(self, signals: Signals, model: Identified, params: PredictiveParams) -> None:
@@ -130,7 +132,14 @@ class Predictive(ControlLaw):
         whole[upper[0], upper[1]] = whole[upper[1], upper[0]] = torch.arange(upper.shape[1])
         first = self.observer.first[upper[0], upper[1]]
         kept = {"started": 1, "mean": n_a, "covariance": len(first), "drift": n_y, "squares": 2 * n_y, "plan": count}
-        older = {"dv": model.n_dv, "sp": n_cv if self.wanted.ramp else 0, "sp_before": n_cv if self.wanted.ramp else 0}
+        follow = level_gain(model.dv_noise.numpy(), model.dv_change.numpy())
+        levels = model.n_dv if (follow < 1).any() else 0
+        older = {
+            "dv": model.n_dv,
+            "level": levels,
+            "sp": n_cv if self.wanted.ramp else 0,
+            "sp_before": n_cv if self.wanted.ramp else 0,
+        }
         self.kept = kept | {name: n for name, n in older.items() if n}
         self.n_state = sum(self.kept.values())
 
@@ -165,6 +174,7 @@ class Predictive(ControlLaw):
             "mv_half": half,
             "y_scale": y_scale[:n_cv],
             "y_center": y_center[:n_cv],
+            "follow": torch.from_numpy(follow),
         }.items():
             self.register_buffer(name, values.clone())
 
@@ -225,7 +235,8 @@ class Predictive(ControlLaw):
         mean, boost, estimate, plan = self._estimated(now, kept)
         measured = now["v"][..., now["z"].shape[-1] :]
         n_cv = sp.shape[-1]
-        start = torch.cat([mean, measured], dim=-1)
+        levels = [self._level(measured, kept)] if "level" in kept else []
+        start = torch.cat([mean, *(levels or [measured])], dim=-1)
         applied = torch.clamp(now["z"], -1.0, 1.0)
         past = [torch.where(kept["started"] > 0, kept[n], now["sp"]) for n in ("sp", "sp_before") if n in kept]
         plan, ahead = self.planner(start, self.wanted(now["sp"], past), applied, plan)
@@ -236,8 +247,13 @@ class Predictive(ControlLaw):
             boost[..., :n_cv],
         ]
         recipe = [now["sp"], past[0]] if past else []
-        state_next = torch.cat([now["one"], estimate, plan, measured, *recipe], dim=-1).squeeze(-2)
+        state_next = torch.cat([now["one"], estimate, plan, measured, *levels, *recipe], dim=-1).squeeze(-2)
         return self.limited(mv, mv_applied), state_next, torch.cat(info, dim=-1).squeeze(-2)
+
+    def _level(self, measured: Tensor, kept: Named) -> Tensor:
+        """The level (..., 1, n_dv) of the measured disturbances, scaled; without a past, what is measured."""
+        followed = kept["level"] + self.follow * (measured - kept["level"])
+        return torch.where(kept["started"] > 0, followed, measured)
 
     def _first(self, now: Named) -> Tensor:
         """[x, d] (..., 1, n_a) without a past: a rest under loads, or without, which a network may hold better.

@@ -63,10 +63,11 @@ class Trials:
     with the model f, the gains g, the middle m of the MVs' range and the pace p; where p is above 1, a part of a second
     step, which leaves a stable model stable: x+ = F(x) + (p - 1) (F(F(x)) - F(x)) + [load; 0]. States that only
     remember keep their pace. The loads are biases of the MVs and loads at the outputs, in steps and in random walks;
-    the noise is the model's estimate. Every set point is a rest of the loop's own plant, so that all are within reach.
-    An output that never comes to rest, as a level, has set points within its record's range. Errors of gain and pace
-    are what the record leaves open (``likely_error``), and no less than ``GAIN`` and ``PACE``; plants are late by
-    ``DEAD``, and one, which is the model in all else, by what the record leaves open where that is more.
+    the noise is the model's estimate, that of the measured disturbances included. Every set point is a rest of the
+    loop's own plant, so that all are within reach. An output that never comes to rest, as a level, has set points
+    within its record's range. Errors of gain and pace are what the record leaves open (``likely_error``), and no less
+    than ``GAIN`` and ``PACE``; plants are late by ``DEAD``, and one, which is the model in all else, by what the record
+    leaves open where that is more.
     """
 
     model: Identified
@@ -81,6 +82,7 @@ class Trials:
     bias: Tensor  # (n, 2 LOOPS, n_mv) [mv]
     load: Tensor  # (n, 2 LOOPS, n_y) scaled
     noise: Tensor  # (n, 2 LOOPS, n_y) [pv]
+    dv_noise: Tensor  # (n, 2 LOOPS, n_dv) [dv]
 
     @classmethod
     @torch.no_grad()
@@ -114,7 +116,9 @@ class Trials:
         colour = model.colour.numpy()
         sd = deviation((model.noise * model.y_scale).numpy(), colour)
         noise = sd * coloured(rng.normal(size=(n, loops, model.n_y)), colour)
-        drawn = (torch.as_tensor(t) for t in (mv0, gain, pace, late, sp, bias, load, noise))
+        dv_sd = (model.dv_noise * model.v_scale[n_mv:]).numpy()
+        dv_noise = dv_sd * rng.normal(size=(n, loops, model.n_dv))
+        drawn = (torch.as_tensor(t) for t in (mv0, gain, pace, late, sp, bias, load, noise, dv_noise))
         return cls(model, signals, horizon, x0, *drawn)
 
     @torch.no_grad()
@@ -179,7 +183,7 @@ class Trials:
         for k in range(n):
             y, before = model.measured(x), mv
             wanted = self.sp[k].expand(count, -1, -1)
-            mv, state, _ = laws(wanted, torch.cat([y + self.noise[k], more], dim=-1), dv, mv, state)
+            mv, state, _ = laws(wanted, torch.cat([y + self.noise[k], more], dim=-1), dv + self.dv_noise[k], mv, state)
             yield y, before, mv
             acted = [mv, *acted[:-1]]
             late = _late(acted, whole, self.late - whole[:, None])

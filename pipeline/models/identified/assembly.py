@@ -54,8 +54,9 @@ def assembled(
 ) -> Identified:
     """The finished model of fitted ``model`` under inputs late by ``delays`` (n_v,).
 
-    ``known`` are its scaled ``noise`` (n_y,), the noise's ``colour``, the ``load_moves`` (n, n_y) of the record, and
-    what the record leaves open: ``gain_sd``, ``pace_sd``, ``dead_sd``.
+    ``known`` are its scaled ``noise`` (n_y,), the noise's ``colour``, the ``load_moves`` (n, n_y) of the record, the
+    ``dv_noise`` and ``dv_change`` of its measured disturbances, and what the record leaves open: ``gain_sd``,
+    ``pace_sd``, ``dead_sd``.
     """
     whole, n_y, n_v = remembering(model, delays), data.y.shape[1], data.v.shape[1]
     table, covariance = rest_map(model, data.y, data.v, seed)

@@ -29,7 +29,9 @@ class Identified(Model):
     ``rest`` gives the state of a rest from [y scaled, v scaled, 1], ``rest_cov`` the covariance of its error. ``dead``
     holds, for each MV, the fewest whole periods that pass before any output answers (0: the next sample does).
     ``load_moves`` are changes of the loads from row to row over ``recorded`` rows of a record in closed loop, 0 of
-    another: x(k+1) has the sum of them added to its first ``n_y`` states.
+    another: x(k+1) has the sum of them added to its first ``n_y`` states. ``dv_noise`` and ``dv_change`` are standard
+    deviations of the measured disturbances: of their noise, which is 0 where none is seen, and of their own change a
+    period.
 
     Raises ModelError for numbers of signals, states or units that cannot be.
     """
@@ -54,6 +56,8 @@ class Identified(Model):
     rest_cov: Tensor  # (n_x, n_x)
     dead: Tensor  # (n_mv,) [periods]
     load_moves: Tensor  # (recorded, n_y) scaled, a period
+    dv_noise: Tensor  # (n_dv,) scaled
+    dv_change: Tensor  # (n_dv,) scaled, a period
 
     def __init__(self, n_y: int, n_mv: int, n_dv: int, n_x: int, n_hidden: int = 0, recorded: int = 0) -> None:
         super().__init__()
@@ -69,7 +73,7 @@ class Identified(Model):
         self.reserve(y_center=(n_y,), y_scale=(n_y,), v_center=(n_v,), v_scale=(n_v,))
         self.reserve(noise=(n_y,), rest=(n_x, n_y + n_v + 1), rest_cov=(n_x, n_x), dead=(n_mv,))
         self.reserve(colour=(n_y,), gain_sd=(n_mv,), pace_sd=(1,), dead_sd=(1,))
-        self.reserve(load_moves=(recorded, n_y))
+        self.reserve(load_moves=(recorded, n_y), dv_noise=(n_dv,), dv_change=(n_dv,))
 
     @property
     def n_v(self) -> int:

@@ -40,6 +40,7 @@ from pipeline.models.identified.verdict import (
     structure_figures,
 )
 from pipeline.models.part import Learnt, Part, Source
+from pipeline.plants.noise import noise_and_change
 from pipeline.plants.simulator import Array
 from pipeline.records.levels import levels_of, only_between
 from pipeline.records.record import Record
@@ -155,7 +156,10 @@ class IdentifiedPart(Part):
         compared = any(least < most for least, most in selection.dead_times)
         dead = np.array([_later(selection, n_mv)]) if compared else doubt.dead
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": dead}
-        known = {"noise": noise, "colour": colour, "load_moves": _load_moves(fitted.model, whole), **open_to}
+        dv_noise, dv_change = noise_and_change([rows.v[i:j, n_mv:] for i, j in rows.bounds()])
+        disturbances = {"dv_noise": dv_noise, "dv_change": dv_change}
+        loads = {"load_moves": _load_moves(fitted.model, whole)}
+        known = {"noise": noise, "colour": colour, **loads, **disturbances, **open_to}
         model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
@@ -190,6 +194,10 @@ class IdentifiedPart(Part):
             "spectral_radius": gains(fitted.model.plant, problem.data)[2],
             "stability": stability_figures(fitted.model.plant, visited, [s.v for s in whole]),
             "warnings": warnings,
+            "disturbances": {
+                s.name: {"noise_sd": float(sd)}
+                for s, sd in zip(source.signals.dv, dv_noise * scales.v_scale[n_mv:], strict=True)
+            },
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
             "step_responses": response_figures(curves, structure.delays, rows, scales, pvs, inputs),
             "candidates_tried": _table(selection),

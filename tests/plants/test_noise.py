@@ -1,0 +1,59 @@
+"""Noise of measured signals, told from what they do, and the level that follows them best."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import solve_discrete_are
+
+from pipeline.plants.noise import level_gain, noise_and_change
+
+N = 4000
+
+
+def signals(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, float]]:
+    """Signals without noise, and the standard deviation of their changes."""
+    walk = np.cumsum(0.1 * rng.normal(size=N))
+    steps = np.repeat(rng.uniform(-5, 5, N // 100), 100)
+    slow = 8 * np.sin(np.arange(N) / 150)
+    return {name: (s, float(np.diff(s).std())) for name, s in {"walk": walk, "steps": steps, "slow": slow}.items()}
+
+
+@pytest.mark.parametrize("kind", ["walk", "steps", "slow"])
+@pytest.mark.parametrize("noise", [0.1, 0.5])
+def test_noise_is_told_from_what_the_signal_does(kind: str, noise: float) -> None:
+    rng = np.random.default_rng(3)
+    clean, change = signals(rng)[kind]
+    seen = clean + noise * rng.normal(size=N)
+    found = noise_and_change([seen[: N // 2, None], seen[N // 2 :, None]])
+    loose = 0.5 if kind == "steps" and noise < change else 0.25
+    assert found[0] == pytest.approx([noise], rel=loose)
+    assert found[1] == pytest.approx([change], rel=0.3, abs=0.1)
+
+
+@pytest.mark.parametrize("kind", ["walk", "steps", "slow"])
+def test_a_signal_without_noise_has_none(kind: str) -> None:
+    clean, change = signals(np.random.default_rng(5))[kind]
+    noise, own = noise_and_change([clean[:, None]])
+    assert noise == 0
+    assert own == pytest.approx([change], rel=0.02)
+
+
+def test_a_short_record_and_one_without_disturbances_say_nothing() -> None:
+    for found in (noise_and_change([np.zeros((3, 2))]), noise_and_change([np.zeros((3, 2)), np.ones((2, 2))])):
+        assert [part.tolist() for part in found] == [[0, 0], [0, 0]]
+    assert [part.shape for part in noise_and_change([np.zeros((50, 0))])] == [(0,), (0,)]
+
+
+@given(noise=st.floats(0.05, 10), change=st.floats(0.05, 10))
+def test_the_level_follows_as_the_steady_kalman_filter(noise: float, change: float) -> None:
+    one = np.eye(1)
+    ahead = solve_discrete_are(one, one, change**2 * one, noise**2 * one)[0, 0]
+    assert level_gain(np.array([noise]), np.array([change])) == pytest.approx([ahead / (ahead + noise**2)], rel=1e-6)
+
+
+def test_a_signal_without_noise_is_its_level() -> None:
+    assert level_gain(np.zeros(2), np.array([0.3, 0.0])).tolist() == [1, 1]
+    assert level_gain(np.ones(1), np.zeros(1)).tolist() == [0]
