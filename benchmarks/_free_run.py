@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.linear_start import Realizations, high_order_arx
-from pipeline.models.identified.output_error import OutputError, fit_starts
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales, informative
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
+from loopwright.pipeline.models.identified.output_error import OutputError, fit_starts
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, informative
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 Array = NDArray[np.float64]
 

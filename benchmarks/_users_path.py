@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from _free_run import Part, Predictor
 
-from pipeline.models.base import load_model
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.base import load_model
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.identified import Identified
 
 ROOT = Path(__file__).parents[1]
 PROJECT = ("dvc.yaml", ".dvcignore", ".gitignore", ".dvc/config", ".dvc/.gitignore")
@@ -41,6 +41,7 @@ class Project:
         (folder / ".dvc").mkdir(parents=True)
         for package in ("pipeline", "serving"):
             shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / "tools" / "roots", folder / "tools" / "roots", symlinks=True)
         for name in PROJECT:
             shutil.copy(ROOT / name, folder / name)
         subprocess.run(["git", "init", "--quiet"], check=True, cwd=folder)
@@ -59,7 +60,7 @@ class Project:
             (self.folder / f"{name}-tags.csv").write_text("tag,role,ends\ny,pv,keep\nu,mv,\n")
             tags = ["--tags", f"{name}-tags.csv"]
         period = ["--period", f"{period_s:.10g}"]
-        code, lines = self._run("pipeline", "new", name, file, *tags, *period, *["--anyway"] * anyway)
+        code, lines = self._run("loopwright.pipeline", "new", name, file, *tags, *period, *["--anyway"] * anyway)
         said = next((line.rpartition(": ")[2] for line in lines if line.startswith("can these data carry")), "none")
         why = next((line.partition("params.yaml: ")[2] for line in lines if "was not added" in line), "")
         return Answer(said, (why or lines[-1]) if code else "", lines)
@@ -72,13 +73,13 @@ class Project:
         data = Path("work") / name / "records" / "screened" / "record.parquet"
         if seed:
             if not (self.folder / data).exists():
-                self._run("pipeline.engine.start", "screen", name)
+                self._run("loopwright.pipeline.engine.start", "screen", name)
             own = Path("data") / name / f"of_seed{seed}"
             (self.folder / own).mkdir(exist_ok=True)
             shutil.copy(self.folder / data, self.folder / own / f"seed{seed}.parquet")
             data = own
         self._learn_from(name, data)
-        code, lines = self._run("pipeline", "run", f"{name}-identified")
+        code, lines = self._run("loopwright.pipeline", "run", f"{name}-identified")
         if code:
             return None, lines[-1]
         models = self.folder / "work" / name / "models" / "identified"
@@ -98,7 +99,10 @@ class Project:
 
     def _run(self, module: str, *words: str) -> tuple[int, list[str]]:
         """Exit status of a command of the product and the lines that it printed."""
-        own = {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(self.folder)}
+        own = {
+            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+            "PYTHONPATH": str(self.folder / "tools/roots"),
+        }
         done = subprocess.run(
             [sys.executable, "-m", module, *words],
             cwd=self.folder, env={**os.environ, **own}, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,

@@ -20,16 +20,16 @@ import numpy as np
 from _exports import CLEAN, PERIOD_S, TAGS, Export, experiment
 from _spoilt_exports import KINDS, Kind
 
-from pipeline.errors import ModelError, PipelineError
-from pipeline.historian.reading import read_export
-from pipeline.historian.screening import Screened, screened
-from pipeline.historian.tags import named
-from pipeline.models.identified.linear_start import Realizations, high_order_arx
-from pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ModelError, PipelineError
+from loopwright.pipeline.historian.reading import read_export
+from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.tags import named
+from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
+from loopwright.pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 PAGE = Path("docs") / "damage.md"
 ORDERS = (2, 3, 4)

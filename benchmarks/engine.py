@@ -15,15 +15,15 @@ import tempfile
 import time
 from pathlib import Path
 
-from pipeline.engine.cluster import connected, local_cluster
-from pipeline.engine.parallel import parallel_map
-from pipeline.engine.preload import load
+from loopwright.pipeline.engine.cluster import connected, local_cluster
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.engine.preload import load
 
 ROOT = Path(__file__).parents[1]
 CLIENT = """
 import os
-from pipeline.engine import remote
-from pipeline.engine.stage_files import StageFiles
+from loopwright.pipeline.engine import remote
+from loopwright.pipeline.engine.stage_files import StageFiles
 
 remote.run_on({at!r}, ["nothing", "at_all"], StageFiles((), ()))
 os._exit(0)
@@ -56,7 +56,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             for _ in range(STARTS):
                 begun = time.perf_counter()
-                environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+                environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
                 subprocess.run(command, cwd=folder, env=environment, check=True, capture_output=True)
                 taken.append(time.perf_counter() - begun)
         print(f"a stage's client: {statistics.median(taken):.2f} s ({min(taken):.2f} to {max(taken):.2f})")

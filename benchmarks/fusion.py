@@ -29,8 +29,8 @@ import onnx
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from pipeline.export.fusion import fused
-from serving.manifest import MANIFEST_KEY, Manifest
+from loopwright.pipeline.export.fusion import fused
+from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 
 Array = NDArray[np.float64]
 ALLOWED = 1e-9
@@ -39,7 +39,7 @@ BY_HAND = "8fdd8e22cfe429fbf278fe536fceb5618d9e2b89"
 
 
 def session(model: bytes, optimized: Path | None = None) -> Any:
-    """As serving.controller makes it; its optimized graph goes to a file."""
+    """As loopwright.serving.controller makes it; its optimized graph goes to a file."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL

@@ -3,10 +3,10 @@
 ``python benchmarks/hosts.py [FILE.onnx ...]``; without files, every controller in artifacts/. About three minutes.
 A host whose parts are missing is named and left out: C needs cmake, a C compiler and ONNXRUNTIME_DIR
 (``tools/onnxruntime_c.sh build/onnxruntime``), Node and the browser ``npm ci`` in examples/embed/node and
-examples/embed/browser. Each host runs the kit of ``loopwright conformance`` and ``serving.conformance`` compares its
-answers. Step: the median over the kit's steps; in Node over 600 equal ones, in the browser over 30 blocks of 20,
-because its clock counts in 100 us; the lowest of three rounds, because on a shared machine whole rounds run slower.
-A difference is a share of the entry's scale; same bits: in every number of the file.
+examples/embed/browser. Each host runs the kit of ``loopwright conformance`` and ``loopwright.serving.conformance``
+compares its answers. Step: the median over the kit's steps; in Node over 600 equal ones, in the browser over 30 blocks
+of 20, because its clock counts in 100 us; the lowest of three rounds, because on a shared machine whole rounds run
+slower. A difference is a share of the entry's scale; same bits: in every number of the file.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from pathlib import Path
 
 import numpy as np
 
-from serving import Controller, LoopwrightError
-from serving.conformance.check import Verdict, check
-from serving.conformance.kit import write_kit
+from loopwright.serving import Controller, LoopwrightError
+from loopwright.serving.conformance.check import Verdict, check
+from loopwright.serving.conformance.kit import write_kit
 
 ROOT = Path(__file__).resolve().parents[1]
 EMBED = ROOT / "examples" / "embed"

@@ -30,7 +30,7 @@ from _made_records import MADE
 from _public_records import PUBLIC, Published, public_task
 from _users_path import Project
 
-from pipeline.errors import PipelineError
+from loopwright.pipeline.errors import PipelineError
 
 HEAD = (
     "record",

@@ -10,8 +10,8 @@ import argparse
 
 import numpy as np
 
-from serving.journal.packing import packed
-from serving.journal.writer import BLOCK
+from loopwright.serving.journal.packing import packed
+from loopwright.serving.journal.writer import BLOCK
 
 SET_POINTS, STEP = 3, 400 / 4096
 YEAR_S = 365.25 * 86_400

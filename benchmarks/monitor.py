@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.cases import CASES
-from serving import Command, Controller, Mode, Sample
-from serving.monitor import Monitor
+from loopwright.pipeline.cases import CASES
+from loopwright.serving import Command, Controller, Mode, Sample
+from loopwright.serving.monitor import Monitor
 
 ROOT = Path(__file__).parents[1]
 WEEK_S, LOOK_S = 7 * 86_400.0, 10.0

@@ -28,12 +28,21 @@ from pathlib import Path
 
 import numpy as np
 
-from serving import Command, Controller, ControlLoop, Mode, MonotonicClock, Sample, SimulatedEndpoint, VirtualClock
-from serving.journal import Journal
-from serving.opcua.settings import Nodes, Point, Server
-from serving.station.recorder import Recorder
-from serving.station.settings import JournalSettings, Settings
-from serving.station.station import Station
+from loopwright.serving import (
+    Command,
+    Controller,
+    ControlLoop,
+    Mode,
+    MonotonicClock,
+    Sample,
+    SimulatedEndpoint,
+    VirtualClock,
+)
+from loopwright.serving.journal import Journal
+from loopwright.serving.opcua.settings import Nodes, Point, Server
+from loopwright.serving.station.recorder import Recorder
+from loopwright.serving.station.settings import JournalSettings, Settings
+from loopwright.serving.station.station import Station
 
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "artifacts" / "henson_seborg_cstr" / "predictive.onnx"
@@ -166,7 +175,7 @@ def station(folder: Path, speed: float, page: str, watched: Watched) -> Iterator
     serve = [
         sys.executable,
         "-m",
-        "pipeline",
+        "loopwright.pipeline",
         "plant",
         "serve",
         FILE.parent.name,

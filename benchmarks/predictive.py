@@ -18,19 +18,19 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from pipeline.export.gate import export
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.models.identified.assembly import assembled, noise_of
-from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.lagged_start import with_units
-from pipeline.models.identified.linear_start import Realizations, high_order_arx
-from pipeline.models.identified.output_error import OutputError, residuals
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
-from serving import Controller, Signal
-from serving.bench import bench
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.models.identified.assembly import assembled, noise_of
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.lagged_start import with_units
+from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
+from loopwright.pipeline.models.identified.output_error import OutputError, residuals
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
+from loopwright.serving import Controller, Signal
+from loopwright.serving.bench import bench
 
 HOLD, LEVELS = 60, 8
 

@@ -33,9 +33,9 @@ SWEEPS = 0.7  # of the time, for the two sweeps
 
 def data(seed: int) -> tuple[Any, ...]:
     """X and y for training, then for validation: the paper's 60,000 random steps, 70 % of them for training."""
-    from pipeline.cases import PLANTS
-    from pipeline.excitation import EXCITATIONS
-    from pipeline.models.training.regressors import inverse_pairs
+    from loopwright.pipeline.cases import PLANTS
+    from loopwright.pipeline.excitation import EXCITATIONS
+    from loopwright.pipeline.models.training.regressors import inverse_pairs
 
     plant = PLANTS["thiosulfate_cstr"]()
     record = EXCITATIONS["random_steps"](samples=60_000).run(plant, seed)
@@ -45,7 +45,7 @@ def data(seed: int) -> tuple[Any, ...]:
 
 def ours(x: Any, y: Any, x_val: Any, y_val: Any, counts: list[int]) -> Any:
     """The same rows and seconds from Loopwright."""
-    from pipeline.models.static.sweep import sweep
+    from loopwright.pipeline.models.static.sweep import sweep
 
     begun = time.perf_counter()
     with redirect_stderr(StringIO()):  # its closing line, once a turn
@@ -64,7 +64,7 @@ def one_network(x: Any, y: Any, x_val: Any, y_val: Any, c: int, seconds: float) 
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import FunctionTransformer, MinMaxScaler
 
-    from pipeline.models.static.fuzzy_means import FuzzyMeansRBF
+    from loopwright.pipeline.models.static.fuzzy_means import FuzzyMeansRBF
 
     mine, end = FuzzyMeansRBF(c), time.monotonic() + seconds
 

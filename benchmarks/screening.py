@@ -27,9 +27,9 @@ import pyarrow.parquet as pq
 from _exports import START_S, Array, steps
 from scipy.signal import lfilter
 
-from pipeline.__main__ import main as loopwright
-from pipeline.commands import new
-from pipeline.historian import exported, screening
+from loopwright.pipeline.__main__ import main as loopwright
+from loopwright.pipeline.commands import new
+from loopwright.pipeline.historian import exported, screening
 
 BLOCK = 250_000  # rows that are made at a time: this process must stay smaller than the one that is measured
 WANTED_ROWS, WANTED_S, WANTED_MB = 5_000_000, 60.0, 1500.0

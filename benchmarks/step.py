@@ -22,10 +22,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.cases import CASES
-from pipeline.optimal.perfect import PerfectNmpc
-from serving import Controller, LoopwrightError
-from serving.bench import bench
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.optimal.perfect import PerfectNmpc
+from loopwright.serving import Controller, LoopwrightError
+from loopwright.serving.bench import bench
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Where the time of a controller's step goes: the graph, and each check and copy of Python around it.
 
 ``python benchmarks/step_parts.py [FILE.onnx ...]``; without files, a small and a large controller of artifacts/. Each
-part is what ``serving.controller.Controller.step`` does, by itself, in the same process and in turn with the others;
-figures are the lowest median of ``--rounds`` rounds [us]. What no row has is the call of ``step`` and its keywords.
+part is what ``loopwright.serving.controller.Controller.step`` does, by itself, in the same process and in turn with the
+others; figures are the lowest median of ``--rounds`` rounds [us]. What no row has is the call of ``step`` and its
+keywords.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from serving.controller import Controller, Step
+from loopwright.serving.controller import Controller, Step
 
 ARTIFACTS = Path(__file__).parents[1] / "artifacts"
 SHOWN = ("ph_neutralization/pid.onnx", "ph_neutralization/gauss_newton_pid.onnx", "ph_neutralization/predictive.onnx")

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import CASES
-from pipeline.engine.cluster import connected, local_cluster
-from pipeline.engine.parallel import parallel_map
-from pipeline.engine.preload import load
-from pipeline.evaluation.stress.draws import Drawing
-from pipeline.evaluation.stress.loops import Stress
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.engine.cluster import connected, local_cluster
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.engine.preload import load
+from loopwright.pipeline.evaluation.stress.draws import Drawing
+from loopwright.pipeline.evaluation.stress.loops import Stress
 
 FILES = ("ph_neutralization/pid", "ph_neutralization/predictive", "henson_seborg_cstr/pid")
 BATCH = 20  # loops of a piece while workers are compared
@@ -66,7 +66,7 @@ def alone(file: Path, seconds: float) -> tuple[Stress, float]:
 
 def law_share(stress: Stress) -> float:
     """Share of a batch's time that is the steps of the law, its session included."""
-    from serving.rows import ControllerRows
+    from loopwright.serving.rows import ControllerRows
 
     whole, spent = ControllerRows.step, 0.0
 

@@ -24,9 +24,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.models.static.mlp import MLP
-from pipeline.models.training.fit import LBFGS, Adam, LevenbergMarquardt, Trainer
-from pipeline.models.training.objectives import Objective, Samples, Windows
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.training.fit import LBFGS, Adam, LevenbergMarquardt, Trainer
+from loopwright.pipeline.models.training.objectives import Objective, Samples, Windows
 
 Array = NDArray[np.float64]
 ROWS = 8_000
@@ -102,9 +102,9 @@ def compare(
 
 
 def cstr(seconds: float, seeds: int) -> None:
-    from pipeline.cases import PLANTS
-    from pipeline.excitation import EXCITATIONS
-    from pipeline.models.training.regressors import forward_pairs
+    from loopwright.pipeline.cases import PLANTS
+    from loopwright.pipeline.excitation import EXCITATIONS
+    from loopwright.pipeline.models.training.regressors import forward_pairs
 
     plant = PLANTS["thiosulfate_cstr"]()
     pairs = [
@@ -157,9 +157,9 @@ def example(seconds: float, seeds: int) -> None:
 
 
 def ph(seconds: float, seeds: int) -> None:
-    from pipeline.cases import PLANTS
-    from pipeline.excitation import EXCITATIONS
-    from pipeline.models.training.regressors import nnarx_pairs, split_in_time
+    from loopwright.pipeline.cases import PLANTS
+    from loopwright.pipeline.excitation import EXCITATIONS
+    from loopwright.pipeline.models.training.regressors import nnarx_pairs, split_in_time
 
     plant = PLANTS["ph_neutralization_15s"]()
     record, other = (EXCITATIONS["random_steps"](samples=2_000, hold=8).run(plant, seed) for seed in (0, 1))

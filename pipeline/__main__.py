@@ -1,4 +1,4 @@
-"""``loopwright``: the one command. Each of its commands is a module of ``pipeline.commands``."""
+"""``loopwright``: the one command. Each of its commands is a module of ``loopwright.pipeline.commands``."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import sys
 from collections.abc import Sequence
 from types import ModuleType
 
-from pipeline.commands import COMMANDS, Parser
-from pipeline.commands.extras import advice
-from pipeline.engine.command import FAILURES, reason
-from pipeline.errors import nearest
-from serving.arguments import write_any_text
-from serving.version import __version__
+from loopwright.pipeline.commands import COMMANDS, Parser
+from loopwright.pipeline.commands.extras import advice
+from loopwright.pipeline.engine.command import FAILURES, reason
+from loopwright.pipeline.errors import nearest
+from loopwright.serving.arguments import write_any_text
+from loopwright.serving.version import __version__
 
 EXAMPLES = """examples:
   loopwright run                                   the whole pipeline
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _loaded(name: str) -> ModuleType:
     """The module of a command. Its imports stay: looking through them for garbage took a sixth of the time."""
-    module = f"pipeline.commands.{name}"
+    module = f"loopwright.pipeline.commands.{name}"
     if (found := sys.modules.get(module)) is not None:  # frozen at each call, a caller's garbage would pile up
         return found
     looking = gc.isenabled()

@@ -17,8 +17,8 @@ LoopwrightError (serving)
 
 from __future__ import annotations
 
-from serving.errors import LoopwrightError
-from serving.fields import nearest
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.fields import nearest
 
 __all__ = [
     "ExportError",

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import PipelineError
+from loopwright.pipeline.errors import PipelineError
 
 
 @contextlib.contextmanager

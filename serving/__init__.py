@@ -1,9 +1,9 @@
 """Loopwright's runtime: one .onnx file stepped as a controller. Needs numpy and onnxruntime, nothing else."""
 
-from serving.clock import Clock, MonotonicClock, VirtualClock
-from serving.controller import Step
-from serving.endpoint import Endpoint, SimulatedEndpoint
-from serving.errors import (
+from loopwright.serving.clock import Clock, MonotonicClock, VirtualClock
+from loopwright.serving.controller import Step
+from loopwright.serving.endpoint import Endpoint, SimulatedEndpoint
+from loopwright.serving.errors import (
     ArtifactError,
     ContractError,
     EndpointError,
@@ -13,13 +13,13 @@ from serving.errors import (
     SampleError,
     SignatureError,
 )
-from serving.fallback import Fallback
-from serving.grid import RunReport
-from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
-from serving.loop import Command, ControlLoop, Mode
-from serving.manifest import Manifest, Signal
-from serving.trust import Controller
-from serving.version import __version__ as __version__
+from loopwright.serving.fallback import Fallback
+from loopwright.serving.grid import RunReport
+from loopwright.serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
+from loopwright.serving.loop import Command, ControlLoop, Mode
+from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.trust import Controller
+from loopwright.serving.version import __version__ as __version__
 
 __all__ = [
     "Allowed",

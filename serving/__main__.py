@@ -1,4 +1,4 @@
-"""``python -m serving``: inspect, bench, sign and verify a controller file, or write test vectors of it."""
+"""``python -m loopwright.serving``: inspect, bench, sign and verify a controller file, or write test vectors of it."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from serving.arguments import Parser, write_any_text
-from serving.bench import bench, table
-from serving.card import card, card_json
-from serving.conformance.check import check
-from serving.conformance.kit import VECTORS, write_kit
-from serving.errors import LoopwrightError
-from serving.signing import command as signing
-from serving.trust import Controller
-from serving.words import plain
+from loopwright.serving.arguments import Parser, write_any_text
+from loopwright.serving.bench import bench, table
+from loopwright.serving.card import card, card_json
+from loopwright.serving.conformance.check import check
+from loopwright.serving.conformance.kit import VECTORS, write_kit
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.signing import command as signing
+from loopwright.serving.trust import Controller
+from loopwright.serving.words import plain
 
 
 def inspect_options(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +87,7 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; 0 if it went well, 1 if a host failed, 2 after one line on standard error."""
     write_any_text()
-    parser = Parser(prog="python -m serving", description="Look at a controller file.")
+    parser = Parser(prog="python -m loopwright.serving", description="Look at a controller file.")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for name, (words, add, _) in COMMANDS.items():
         add(commands.add_parser(name, help=words))

@@ -10,12 +10,12 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.errors import ContractError, SampleError
-from serving.fault import reworded
-from serving.guard import Sample, implausible
-from serving.manifest import Signal
-from serving.ranges import numbers
-from serving.standing import Standing
+from loopwright.serving.errors import ContractError, SampleError
+from loopwright.serving.fault import reworded
+from loopwright.serving.guard import Sample, implausible
+from loopwright.serving.manifest import Signal
+from loopwright.serving.ranges import numbers
+from loopwright.serving.standing import Standing
 
 Array: TypeAlias = NDArray[np.float64]
 

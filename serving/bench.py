@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.clock import MonotonicClock
-from serving.controller import Controller
-from serving.loop import WARM_LEAD_S
+from loopwright.serving.clock import MonotonicClock
+from loopwright.serving.controller import Controller
+from loopwright.serving.loop import WARM_LEAD_S
 
 WARM_UP = 1_000  # steps before the first that counts
 FEEDS = 1_000  # different inputs, taken in turn: more would only fill the caches

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from serving.controller import Controller
-from serving.manifest import Signal
-from serving.proof import judged
-from serving.trust import ending, signer
-from serving.words import plain
+from loopwright.serving.controller import Controller
+from loopwright.serving.manifest import Signal
+from loopwright.serving.proof import judged
+from loopwright.serving.trust import ending, signer
+from loopwright.serving.words import plain
 
 SHOWN = {
     "scenarios",

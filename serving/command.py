@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.mode import Mode
+from loopwright.serving.mode import Mode
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple, NoReturn, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from serving.digest import DIGEST_KEY, file_digest, unseal
-from serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
-from serving.graph_audit import MAX_BYTES, audit
-from serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
-from serving.ranges import numbers
-from serving.step_lock import step_lock
+from loopwright.serving.digest import DIGEST_KEY, file_digest, unseal
+from loopwright.serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
+from loopwright.serving.graph_audit import MAX_BYTES, audit
+from loopwright.serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
+from loopwright.serving.ranges import numbers
+from loopwright.serving.step_lock import step_lock
 
 Array: TypeAlias = NDArray[np.float64]
 _LINE = 8  # float64 in a cache line: each vector starts on one, so that no result depends on its neighbours
@@ -47,7 +47,7 @@ class Controller:
     ------
     ArtifactError
         The file is corrupt, truncated, foreign or changed, holds what a controller may not
-        (see ``serving.graph_audit``), or its manifest and its graph disagree.
+        (see ``loopwright.serving.graph_audit``), or its manifest and its graph disagree.
 
     Notes
     -----

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 
-from serving.errors import ArtifactError
+from loopwright.serving.errors import ArtifactError
 
 DIGEST_KEY = "loopwright.sha256"
 # ModelProto.metadata_props (field 14) holding StringStringEntryProto{key = 1, value = 2}

@@ -8,7 +8,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from serving.guard import Sample
+from loopwright.serving.guard import Sample
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class Endpoint(Protocol):
 
 @runtime_checkable
 class HandsBack(Protocol):
-    """An endpoint that can give the plant to the plant's own controller, for ``serving.fallback``."""
+    """An endpoint that can give the plant to the plant's own controller, for ``loopwright.serving.fallback``."""
 
     def hand_back(self) -> None:
         """Give the plant back."""

@@ -10,9 +10,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.errors import LoopError
-from serving.manifest import Signal
-from serving.ranges import within
+from loopwright.serving.errors import LoopError
+from loopwright.serving.manifest import Signal
+from loopwright.serving.ranges import within
 
 Array: TypeAlias = NDArray[np.float64]
 

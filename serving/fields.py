@@ -12,8 +12,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from serving.errors import LoopwrightError
-from serving.plain_values import shown
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.plain_values import shown
 
 T = TypeVar("T")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from serving.errors import LoopError
+from loopwright.serving.errors import LoopError
 
 TRIES = 20  # as often a file may be taken away in the moment before it is locked
 

@@ -19,14 +19,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from serving import controller, trust
-from serving.errors import ArtifactError, LoopwrightError, OutputError
-from serving.manifest import Manifest
-from serving.own_process import module
-from serving.words import first_line, plain
+from loopwright.serving import controller, trust
+from loopwright.serving.errors import ArtifactError, LoopwrightError, OutputError
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.own_process import module
+from loopwright.serving.words import first_line, plain
 
 if TYPE_CHECKING:
-    from serving.signing.verify import Trusted
+    from loopwright.serving.signing.verify import Trusted
 
 DEADLINE_S = 30.0  # of the whole process; it takes .3 s, and a step at most 2 s
 CHAINED = 3  # steps from a state of zeros at each set of inputs
@@ -37,12 +37,12 @@ NICENESS = 10  # the loop that runs beside it goes first
 def tried(path: str | PathLike[str], sha256: str | None = None, trusted: Trusted | None = None) -> trust.Controller:
     """The controller in a file, once another process has taken its first steps.
 
-    The arguments and errors are those of ``serving.trust.Controller``. ArtifactError too where the file ends that
-    process, does not let it end within 30 s, or onnxruntime cannot compute it. The bytes that were tried are those
+    The arguments and errors are those of ``loopwright.serving.trust.Controller``. ArtifactError too where the file ends
+    that process, does not let it end within 30 s, or onnxruntime cannot compute it. The bytes that were tried are those
     that are loaded: their digest is pinned.
     """
     if trusted is not None:  # nothing of a file that nobody signed is run
-        from serving.signing.verify import verified  # here: it needs the package cryptography
+        from loopwright.serving.signing.verify import verified  # here: it needs the package cryptography
 
         signed = verified(path, trusted).sha256
         sha256 = signed if sha256 is None else sha256
@@ -51,7 +51,9 @@ def tried(path: str | PathLike[str], sha256: str | None = None, trusted: Trusted
 
 def _digest_tried(path: str | PathLike[str], sha256: str | None) -> str:
     """The SHA-256 of the bytes whose first steps another process has survived."""
-    command, environment = module("serving.first_steps", os.fspath(path), *([] if sha256 is None else [sha256]))
+    command, environment = module(
+        "loopwright.serving.first_steps", os.fspath(path), *([] if sha256 is None else [sha256])
+    )
     try:
         done = subprocess.run(
             command,

@@ -9,9 +9,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from serving.controller import Controller, Step
-from serving.errors import ContractError, LoopError
-from serving.manifest import INPUTS, Manifest, Signal
+from loopwright.serving.controller import Controller, Step
+from loopwright.serving.errors import ContractError, LoopError
+from loopwright.serving.manifest import INPUTS, Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
 

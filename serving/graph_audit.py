@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any
 
-from serving.errors import ArtifactError
-from serving.graph_work import BOOL, DOUBLE, ITEM_BYTES, MAX_WORK, RULES, Node, Value, results
-from serving.onnx_bytes import Message, read_model
+from loopwright.serving.errors import ArtifactError
+from loopwright.serving.graph_work import BOOL, DOUBLE, ITEM_BYTES, MAX_WORK, RULES, Node, Value, results
+from loopwright.serving.onnx_bytes import Message, read_model
 
 MAX_BYTES = 64 * 2**20
 # onnxruntime simplifies a graph in a time that grows with the square of its operators: seconds for so many. The largest

@@ -14,7 +14,7 @@ from itertools import zip_longest
 from math import prod
 from typing import TypeAlias
 
-from serving.graph_operators import require_signature
+from loopwright.serving.graph_operators import require_signature
 
 Shape: TypeAlias = tuple[int, ...]
 

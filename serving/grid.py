@@ -9,19 +9,19 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import TYPE_CHECKING, TypeVar
 
-from serving.clock import MonotonicClock
-from serving.endpoint import Endpoint, HandsBack
-from serving.errors import LoopError
-from serving.fault import told_by
-from serving.guard import Sample
-from serving.words import named
+from loopwright.serving.clock import MonotonicClock
+from loopwright.serving.endpoint import Endpoint, HandsBack
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fault import told_by
+from loopwright.serving.guard import Sample
+from loopwright.serving.words import named
 
 if TYPE_CHECKING:
-    from serving.loop import Command, ControlLoop
+    from loopwright.serving.loop import Command, ControlLoop
 
 T = TypeVar("T")
 
-_log = logging.getLogger("serving.loop")
+_log = logging.getLogger("loopwright.serving.loop")
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,10 @@ from typing import Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.errors import LoopError
-from serving.fault import Fault
-from serving.manifest import Manifest, Signal
-from serving.words import first_line
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fault import Fault
+from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.words import first_line
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -42,7 +42,7 @@ class Sample:
 
 
 class Guard(Protocol):
-    """One reason not to act: a text, or a ``serving.fault.Fault``, which also says which reason it is."""
+    """One reason not to act: a text, or a ``loopwright.serving.fault.Fault``, which also says which reason it is."""
 
     @property
     def memory(self) -> int:

@@ -10,12 +10,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.controller import Controller, Step
-from serving.errors import LoopError
-from serving.fitted import fitted
-from serving.guard import Guard, Sample, refused
-from serving.manifest import Manifest
-from serving.successor import Successor
+from loopwright.serving.controller import Controller, Step
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fitted import fitted
+from loopwright.serving.guard import Guard, Sample, refused
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.successor import Successor
 
 Array: TypeAlias = NDArray[np.float64]
 Guards: TypeAlias = Sequence[Guard] | Callable[[Manifest], Sequence[Guard]]

@@ -10,22 +10,22 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from serving.applied import AppliedMV
-from serving.clock import Clock, MonotonicClock
-from serving.command import Command
-from serving.controller import Controller
-from serving.endpoint import Endpoint, HandsBack
-from serving.errors import LoopError
-from serving.fallback import Fallback
-from serving.fault import reworded
-from serving.grid import RunReport, run_on_grid
-from serving.guard import Guard, Sample, default_guards
-from serving.in_charge import Guards, InCharge
-from serving.mode import LoopMode, Mode, mode_of
-from serving.ranges import within
-from serving.successor import Successor
-from serving.transfer import ByHand, Transfer
-from serving.words import first_line
+from loopwright.serving.applied import AppliedMV
+from loopwright.serving.clock import Clock, MonotonicClock
+from loopwright.serving.command import Command
+from loopwright.serving.controller import Controller
+from loopwright.serving.endpoint import Endpoint, HandsBack
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fallback import Fallback
+from loopwright.serving.fault import reworded
+from loopwright.serving.grid import RunReport, run_on_grid
+from loopwright.serving.guard import Guard, Sample, default_guards
+from loopwright.serving.in_charge import Guards, InCharge
+from loopwright.serving.mode import LoopMode, Mode, mode_of
+from loopwright.serving.ranges import within
+from loopwright.serving.successor import Successor
+from loopwright.serving.transfer import ByHand, Transfer
+from loopwright.serving.words import first_line
 
 __all__ = ["WARM_LEAD_S", "Command", "ControlLoop", "Mode", "within"]
 
@@ -79,9 +79,9 @@ class ControlLoop:
         Missed periods in a row after which the law starts cold.
     transfer_s
         After a change to AUTO or of the controller, an MV crosses its range at most once in this time [s], until it
-        is where the law wants it; 0: at once. See ``serving.transfer``.
+        is where the law wants it; 0: at once. See ``loopwright.serving.transfer``.
     fallback
-        What to do when a fault lasts; None: the MV stays. See ``serving.fallback``.
+        What to do when a fault lasts; None: the MV stays. See ``loopwright.serving.fallback``.
 
     Raises
     ------

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
 from typing import Any, Self
 
-from serving.errors import ArtifactError
-from serving.plain_values import MAX_DIGITS, refused, shown
-from serving.words import ACTS
+from loopwright.serving.errors import ArtifactError
+from loopwright.serving.plain_values import MAX_DIGITS, refused, shown
+from loopwright.serving.words import ACTS
 
 SCHEMA = 1
 MANIFEST_KEY = "loopwright.manifest"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from serving.errors import LoopError
-from serving.fallback import Fallback
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fallback import Fallback
 
 
 class Mode(StrEnum):

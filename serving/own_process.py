@@ -9,7 +9,7 @@ import os
 import sys
 from pathlib import Path
 
-HOME = Path(__file__).resolve().parents[1]  # of the package that runs here
+HOME = Path(__file__).resolve().parents[2]  # of the folder loopwright, where this package lies in one
 
 
 def module(name: str, *arguments: str) -> tuple[list[str], dict[str, str]]:

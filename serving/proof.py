@@ -7,8 +7,8 @@ from enum import Enum
 from math import isfinite
 from typing import Any
 
-from serving.errors import NotProvenError
-from serving.manifest import Manifest
+from loopwright.serving.errors import NotProvenError
+from loopwright.serving.manifest import Manifest
 
 
 class Proof(Enum):

@@ -8,8 +8,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from serving.errors import LoopError
-from serving.manifest import Signal
+from loopwright.serving.errors import LoopError
+from loopwright.serving.manifest import Signal
 
 Array: TypeAlias = NDArray[np.float64]
 

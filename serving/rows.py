@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.controller import Array, Controller
-from serving.errors import ContractError
+from loopwright.serving.controller import Array, Controller
+from loopwright.serving.errors import ContractError
 
 
 class StepRows(NamedTuple):

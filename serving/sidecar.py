@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from serving import graph_audit
-from serving.digest import file_digest, unseal
-from serving.errors import ArtifactError
-from serving.manifest import MANIFEST_KEY, MAX_CHARACTERS, Manifest, strictly
+from loopwright.serving import graph_audit
+from loopwright.serving.digest import file_digest, unseal
+from loopwright.serving.errors import ArtifactError
+from loopwright.serving.manifest import MANIFEST_KEY, MAX_CHARACTERS, Manifest, strictly
 
 INDENTED = 16  # times as long at most as the manifest: the deepest entries have a line and 42 blanks of their own
 

@@ -8,8 +8,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.guard import READ_BACK_MARGIN
-from serving.manifest import Signal
+from loopwright.serving.guard import READ_BACK_MARGIN
+from loopwright.serving.manifest import Signal
 
 Array: TypeAlias = NDArray[np.float64]
 

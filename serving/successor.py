@@ -8,9 +8,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.controller import Controller, Step
-from serving.guard import Guard, Sample, refused
-from serving.words import named
+from loopwright.serving.controller import Controller, Step
+from loopwright.serving.guard import Guard, Sample, refused
+from loopwright.serving.words import named
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.manifest import Signal
+from loopwright.serving.manifest import Signal
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
 """The Controller of a host: loaded from a file, and if wanted only from one that a trusted key signed.
 
-Apart from ``serving.controller``, because what steps a controller decides results of the pipeline's stages, and who
-signed its file decides none of them.
+Apart from ``loopwright.serving.controller``, because what steps a controller decides results of the pipeline's stages,
+and who signed its file decides none of them.
 """
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from __future__ import annotations
 from os import PathLike
 from typing import TYPE_CHECKING
 
-from serving import controller
-from serving.errors import ArtifactError
-from serving.fitted import Fitted
+from loopwright.serving import controller
+from loopwright.serving.errors import ArtifactError
+from loopwright.serving.fitted import Fitted
 
 if TYPE_CHECKING:
-    from serving.signing.verify import Signed, Trusted
+    from loopwright.serving.signing.verify import Signed, Trusted
 
 
 class Controller(controller.Controller):
@@ -37,7 +37,7 @@ class Controller(controller.Controller):
         The file is unsigned, signed by none of ``trusted``, or changed since; or its signature expired.
     ArtifactError
         The file is corrupt, truncated, foreign or changed, holds what a controller may not
-        (see ``serving.graph_audit``), or its manifest and its graph disagree.
+        (see ``loopwright.serving.graph_audit``), or its manifest and its graph disagree.
 
     Notes
     -----
@@ -48,7 +48,7 @@ class Controller(controller.Controller):
     def __init__(self, path: str | PathLike[str], sha256: str | None = None, trusted: Trusted | None = None) -> None:
         self.signed: Signed | None = None
         if trusted is not None:
-            from serving.signing.verify import verified  # here: it needs the package cryptography
+            from loopwright.serving.signing.verify import verified  # here: it needs the package cryptography
 
             self.signed = verified(path, trusted)
             if sha256 is not None and sha256.lower() != self.signed.sha256:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Any
 
-from serving.errors import LoopwrightError
+from loopwright.serving.errors import LoopwrightError
 
 # Line breaks, control characters, marks and overrides of direction, the mark of a byte order: they forge a line, clear
 # a screen or turn a text round wherever it is shown.

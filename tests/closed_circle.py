@@ -15,8 +15,8 @@ from pathlib import Path
 from plant_servers import Plant, RunningLoop
 from processes import within
 
-from pipeline.__main__ import main
-from serving.station.control import ask
+from loopwright.pipeline.__main__ import main
+from loopwright.serving.station.control import ask
 
 LAW = "pid"
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 Array = np.ndarray
 PV, MV = Signal("y", "degC", 0.0, 100.0), Signal("u", "%", 0.0, 100.0)
@@ -146,9 +146,9 @@ LOOPS = {
 
 def show(seed: int) -> None:
     """A row a loop."""
-    from pipeline.evaluation.proof import statements  # here, because torch takes seconds to load
-    from pipeline.models.identified.identified_part import IdentifiedPart
-    from pipeline.models.part import Source
+    from loopwright.pipeline.evaluation.proof import statements  # here, because torch takes seconds to load
+    from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+    from loopwright.pipeline.models.part import Source
 
     print("| record | true gain | fit | sign found | one-step predictions | verdict | proven |")
     print("|---" * 7 + "|")

@@ -13,11 +13,11 @@ import numpy as np
 from kits import SHIPPED
 from numpy.typing import NDArray
 
-from pipeline.hosts.fmu.compiling import Toolchain, toolchain
-from pipeline.hosts.fmu.folder import write_folder
-from pipeline.plants.fmu.instance import NAMES
-from serving import Controller
-from serving.conformance.steps import Answer, answered
+from loopwright.pipeline.hosts.fmu.compiling import Toolchain, toolchain
+from loopwright.pipeline.hosts.fmu.folder import write_folder
+from loopwright.pipeline.plants.fmu.instance import NAMES
+from loopwright.serving import Controller
+from loopwright.serving.conformance.steps import Answer, answered
 
 Array = NDArray[np.float64]
 BOOLEAN = {"fault", "use_mv_applied"}

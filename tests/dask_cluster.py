@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from processes import within
 
-from pipeline.engine.cluster import ADDRESS, connected, disconnect
+from loopwright.pipeline.engine.cluster import ADDRESS, connected, disconnect
 
 ROOT = Path(__file__).parents[1]
 QUIET = {"DASK_DISTRIBUTED__WORKER__DAEMON": "True"}

@@ -10,8 +10,8 @@ from threading import Event
 
 from distributed import get_worker
 
-from pipeline.engine.parallel import parallel_map
-from pipeline.errors import PipelineError
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.errors import PipelineError
 
 
 def squares(item: int) -> int:

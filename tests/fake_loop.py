@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from serving import Controller
-from serving.errors import NotProvenError
-from serving.journal import Event, Journal, Scan
-from serving.page.process import PageProcess
-from serving.page.settings import Page
-from serving.station.control import Control
+from loopwright.serving import Controller
+from loopwright.serving.errors import NotProvenError
+from loopwright.serving.journal import Event, Journal, Scan
+from loopwright.serving.page.process import PageProcess
+from loopwright.serving.page.settings import Page
+from loopwright.serving.station.control import Control
 
 BEGIN = 1_790_000_000.0
 THIRDS = [0.0, 1 / 3, 1.0]  # of an MV that is not continuous

@@ -10,9 +10,9 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-from pipeline.plants.fmu.table import FmuRow, FmuTable
-from pipeline.plants.simulator_file import FileSimulator
-from serving.manifest import Signal
+from loopwright.pipeline.plants.fmu.table import FmuRow, FmuTable
+from loopwright.pipeline.plants.simulator_file import FileSimulator
+from loopwright.serving.manifest import Signal
 
 EXAMPLES = Path(__file__).parents[1] / "examples" / "own_simulator"
 EXAMPLE = EXAMPLES / "aeration.fmu"

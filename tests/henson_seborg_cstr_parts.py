@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pipeline.models import Model
-from pipeline.models.local.local_models import LocalModels
-from pipeline.models.local.local_models_part import operating_cv
-from pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.models.local.local_models_part import operating_cv
+from loopwright.pipeline.plants.equations import EquationPlant
 
 POINTS = ({"q_c": 110.0}, {"T": 442.0}, {"T": 450.0}, {"T": 465.0}, {"T": 481.0})
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from pipeline.models import Model
-from pipeline.models.identified.identified import Identified
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.signals import Signals
-from pipeline.simulation.simulate import simulate_open
-from serving.manifest import Signal
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.simulate import simulate_open
+from loopwright.serving.manifest import Signal
 
 HIDDEN = 6
 TOP = 3.0  # of the range of made-up outputs

@@ -18,20 +18,20 @@ import numpy as np
 import yaml
 from onnx import TensorProto, helper, numpy_helper
 
-from pipeline.cases import CASES, beside
-from pipeline.cases.batch_reactor.case import CALMED
-from pipeline.cases.batch_reactor.case import PLAIN as WITHOUT
-from pipeline.evaluation import law_evidence
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.validation import SCHEMA, Validation
-from pipeline.evaluation.verdicts import PLAIN, Claims
-from pipeline.export.controller_file import assembled, write_sidecar
-from pipeline.report.for_programs import validation
-from pipeline.report.page import write_report
-from pipeline.report.verdicts import judge
-from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
-from serving.manifest import Manifest
+from loopwright.pipeline.cases import CASES, beside
+from loopwright.pipeline.cases.batch_reactor.case import CALMED
+from loopwright.pipeline.cases.batch_reactor.case import PLAIN as WITHOUT
+from loopwright.pipeline.evaluation import law_evidence
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.validation import SCHEMA, Validation
+from loopwright.pipeline.evaluation.verdicts import PLAIN, Claims
+from loopwright.pipeline.export.controller_file import assembled, write_sidecar
+from loopwright.pipeline.report.for_programs import validation
+from loopwright.pipeline.report.page import write_report
+from loopwright.pipeline.report.verdicts import judge
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from loopwright.serving.manifest import Manifest
 
 SEEDS = (0, 1, 2)
 GAINS = ("kc", "tau_i_s", "tau_d_s", "penalty", "linearization_error")

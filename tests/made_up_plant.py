@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from pipeline.plants.equations import EquationPlant
-from serving.manifest import Signal
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True)

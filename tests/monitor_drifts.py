@@ -8,8 +8,8 @@ from __future__ import annotations
 import pytest
 from benchmark_modules import benchmark_script
 
-from pipeline.cases import CASES
-from serving.monitor import monitor, pace
+from loopwright.pipeline.cases import CASES
+from loopwright.serving.monitor import monitor, pace
 
 # Of a chart. Fewer than 12 that are independent make it learn four times as long, as here the 10 of the first case do:
 # after 14 blocks of it another verdict would come first.

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from pipeline.evaluation.case import Case
-from pipeline.excitation import Excitation
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.models import MODELS, Model
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.part import Source
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.signals import Signals
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import Trajectory, simulate_closed
-from serving.manifest import Signal
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.excitation import Excitation
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.models import MODELS, Model
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
+from loopwright.serving.manifest import Signal
 
 DV = torch.zeros(0, dtype=torch.float64)
 

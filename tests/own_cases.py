@@ -11,13 +11,13 @@ import torch
 import yaml
 from identified_models import scaled_model
 
-from pipeline.cases.own_plant import OwnCase, own_case
-from pipeline.laws import ControlLaw
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import Trajectory, simulate_closed
-from serving.manifest import Signal
+from loopwright.pipeline.cases.own_plant import OwnCase, own_case
+from loopwright.pipeline.laws import ControlLaw
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
+from loopwright.serving.manifest import Signal
 
 GAINS = np.array([[2.0, -0.8], [0.6, 1.5]])
 POLES = (np.array([0.9, 0.8]), np.array([0.88, 0.82]), np.array([0.91, 0.78]))

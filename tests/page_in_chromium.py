@@ -11,7 +11,7 @@ import pytest
 from chromium import come_in
 from fake_loop import BEGIN, THIRDS, FakeLoop, opened
 
-from serving import Controller
+from loopwright.serving import Controller
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -20,13 +20,13 @@ from typing import Any, ClassVar
 
 from processes import within
 
-from pipeline.simulation import opcua_server
-from serving import Command, Controller, LoopError, Mode, Sample
-from serving.journal import JournalReader, Scan
-from serving.station.control import ask
-from serving.station.requests import Change
-from serving.station.settings import Settings
-from serving.station.station import Station
+from loopwright.pipeline.simulation import opcua_server
+from loopwright.serving import Command, Controller, LoopError, Mode, Sample
+from loopwright.serving.journal import JournalReader, Scan
+from loopwright.serving.station.control import ask
+from loopwright.serving.station.requests import Change
+from loopwright.serving.station.settings import Settings
+from loopwright.serving.station.station import Station
 
 ROOT = Path(__file__).parents[1]
 UNKNOWN = "where the MV stands is not known"  # why a loop that has just lost its plant refuses for some scans
@@ -75,14 +75,14 @@ class Plant:
         self.folder, self.port = folder, free_port()
         self.endpoint, self.log = f"opc.tcp://127.0.0.1:{self.port}", folder / "mv.jsonl"
         self._command = [
-            sys.executable, "-m", "pipeline", "plant", "serve", case, "--listen", f"127.0.0.1:{self.port}",
+            sys.executable, "-m", "loopwright.pipeline", "plant", "serve", case, "--listen", f"127.0.0.1:{self.port}",
             "--speed", f"{speed:g}", "--folder", str(folder / "server"), "--log", str(self.log), *options,
         ]  # fmt: skip
         self.process: subprocess.Popen[str] | None = None
 
     def start(self) -> None:
         before = len(self.actuator())
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
         with (self.folder / "server.log").open("a") as said:
             self.process = subprocess.Popen(
                 self._command, cwd=self.folder, env=environment, stdout=said, stderr=said, text=True

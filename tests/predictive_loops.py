@@ -9,8 +9,8 @@ import torch
 from identified_models import made_signals
 from torch import Tensor
 
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.models.identified.identified import Identified
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.models.identified.identified import Identified
 
 NONE = torch.zeros(0, dtype=torch.float64)
 

@@ -21,20 +21,20 @@ import torch
 from shipped import required
 from threadpoolctl import threadpool_limits
 
-from pipeline.cases import PLANTS
-from pipeline.export import gate
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.models import Model
-from pipeline.models.lagged.arx import ARX
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.static.fuzzy_means import FuzzyMeansRBF
-from pipeline.models.static.leverage_domain import LeverageDomain
-from pipeline.models.training.fit import LevenbergMarquardt
-from pipeline.models.training.objectives import Samples
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.signals import Signals
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import simulate_batch
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.export import gate
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.lagged.arx import ARX
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.static.fuzzy_means import FuzzyMeansRBF
+from loopwright.pipeline.models.static.leverage_domain import LeverageDomain
+from loopwright.pipeline.models.training.fit import LevenbergMarquardt
+from loopwright.pipeline.models.training.objectives import Samples
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import simulate_batch
 
 # What is imported stays: looking through it for garbage again and again takes a tenth of all CPU time.
 gc.disable()

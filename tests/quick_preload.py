@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pipeline.engine import preload
-from pipeline.engine.preload import dask_setup
+from loopwright.pipeline.engine import preload
+from loopwright.pipeline.engine.preload import dask_setup
 
 __all__ = ["dask_setup"]
 

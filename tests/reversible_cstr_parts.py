@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.laws.reference.reference_loops import Training
-from pipeline.models import Model
-from pipeline.models.state_space.state_space import StateSpace
-from pipeline.models.training.fit import LevenbergMarquardt
-from pipeline.models.training.objectives import Samples
-from pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.laws.reference.reference_loops import Training
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.state_space.state_space import StateSpace
+from loopwright.pipeline.models.training.fit import LevenbergMarquardt
+from loopwright.pipeline.models.training.objectives import Samples
+from loopwright.pipeline.plants.equations import EquationPlant
 
 # What the laws of the reactor need to be trained quickly: good enough to hold their contract.
 QUICK = {"training": Training(hidden=4, lanes=12, holds=1, hold=40, noise=0.002, iterations=4, restarts=1)}

@@ -12,8 +12,8 @@ import pytest
 from asyncua import Client, ua
 from plant_servers import CASE, SPACE, Plant, RunningLoop, Wire, loop_toml
 
-from serving.opcua.settings import ModeNode
-from serving.station.settings import Hold, Settings
+from loopwright.serving.opcua.settings import ModeNode
+from loopwright.serving.station.settings import Hold, Settings
 
 SPEED = 2.5  # 0.5 s periods in 0.2 s
 PERIOD_S = 0.5 / SPEED

@@ -17,8 +17,8 @@ from pathlib import Path
 import requests
 from processes import within
 
-from pipeline.engine.lifeline import end_with_parent
-from pipeline.engine.start import STAGES
+from loopwright.pipeline.engine.lifeline import end_with_parent
+from loopwright.pipeline.engine.start import STAGES
 
 ROOT = Path(__file__).parents[1]
 BUCKETS = ("mlflow", "dvc")
@@ -158,7 +158,7 @@ def _begun_mlflow(made: Servers, database: str, s3: str) -> int:
 DASK = (sys.executable, "-m", "dask")
 # The sources, and none of the files of a run.
 OF_DASK = {
-    "PYTHONPATH": str(ROOT),
+    "PYTHONPATH": str(ROOT / "tools/roots"),
     "DASK_DISTRIBUTED__WORKER__DAEMON": "True",
     STAGES: "excite,fit,design,validate",
 }
@@ -172,5 +172,13 @@ def _begun_scheduler(made: Servers) -> int:
 
 def _worker(made: Servers, scheduler: int) -> None:
     """A worker of one thread. One: each loads its libraries for 8 s of a core."""
-    options = ("--nthreads", "1", "--memory-limit", "0", "--preload", "pipeline.engine.preload", "--no-dashboard")
+    options = (
+        "--nthreads",
+        "1",
+        "--memory-limit",
+        "0",
+        "--preload",
+        "loopwright.pipeline.engine.preload",
+        "--no-dashboard",
+    )
     made.start("worker", *DASK, "worker", f"tcp://127.0.0.1:{scheduler}", *options, env=OF_DASK)

@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.params import parse, read_section, sections
-from pipeline.laws import LAWS
+from loopwright.pipeline.config.params import parse, read_section, sections
+from loopwright.pipeline.laws import LAWS
 
 PARAMS = Path(__file__).parents[1] / "params.yaml"
 

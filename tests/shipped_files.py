@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pipeline.cases import CASES
+from loopwright.pipeline.cases import CASES
 
 ARTIFACTS = Path(__file__).resolve().parents[1] / "artifacts"
 SHIPPED = sorted(file for file in ARTIFACTS.glob("*/*.onnx") if file.parent.name in CASES)

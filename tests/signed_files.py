@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from signing_parts import NOW
 
-from serving.signing.keys import PrivateKey, PublicKey, make_pair
-from serving.signing.sign import sign
+from loopwright.serving.signing.keys import PrivateKey, PublicKey, make_pair
+from loopwright.serving.signing.sign import sign
 
 
 @pytest.fixture(scope="session")

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 from plant_servers import Plant, RunningLoop
 
-from pipeline.__main__ import main
-from serving.signing.keys import PrivateKey
-from serving.signing.sign import sign
+from loopwright.pipeline.__main__ import main
+from loopwright.serving.signing.keys import PrivateKey
+from loopwright.serving.signing.sign import sign
 
 ARTIFACTS = Path(__file__).parents[1] / "artifacts" / "thiosulfate_cstr"
 SPEED = 2.5  # periods of .2 s

@@ -8,9 +8,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from serving.signing import bundle
-from serving.signing.keys import PrivateKey
-from serving.signing.verify import signature_of
+from loopwright.serving.signing import bundle
+from loopwright.serving.signing.keys import PrivateKey
+from loopwright.serving.signing.verify import signature_of
 
 NOW = datetime(2026, 5, 1, 12, tzinfo=UTC)
 DAY_AFTER = datetime(2026, 5, 2, 12, tzinfo=UTC)

@@ -12,12 +12,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.export.controller_file import assembled, with_evidence
-from pipeline.export.gate import export
-from pipeline.laws import ControlLaw
-from pipeline.plants.signals import Signals
-from serving import Controller, Signal
-from serving.digest import TRAILER_BYTES
+from loopwright.pipeline.export.controller_file import assembled, with_evidence
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws import ControlLaw
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving import Controller, Signal
+from loopwright.serving.digest import TRAILER_BYTES
 
 SIGNALS = Signals(
     period_s=0.5,

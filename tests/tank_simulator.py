@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.plants.simulator import Array, Simulator
-from serving.manifest import Signal
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True)

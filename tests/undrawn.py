@@ -14,7 +14,7 @@ def draw_nothing(patch: pytest.MonkeyPatch) -> None:
     Build none of a screening: its page is half of what ``loopwright new`` computes: up to 90 panels.
     """
     for name in SCREENING:
-        patch.setattr(f"pipeline.report.screening.{name}", lambda found: Figure())
-    for module in ("pipeline.pictures.png", "pipeline.report.screening"):
+        patch.setattr(f"loopwright.pipeline.report.screening.{name}", lambda found: Figure())
+    for module in ("loopwright.pipeline.pictures.png", "loopwright.pipeline.report.screening"):
         patch.setattr(f"{module}.png", lambda canvas: b"")
-    patch.setattr("pipeline.pictures.drawing.lay_out", lambda canvas: None)
+    patch.setattr("loopwright.pipeline.pictures.drawing.lay_out", lambda canvas: None)

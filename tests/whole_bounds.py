@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from pipeline.evaluation.case import Case
-from pipeline.optimal.bounds import Bounds, stored_bounds
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.optimal.bounds import Bounds, stored_bounds
 
 
 def whole_bounds(case: Case, path: Path | None = None) -> Bounds:

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from serving import Controller
-from serving.manifest import Manifest, Signal
+from loopwright.serving import Controller
+from loopwright.serving.manifest import Manifest, Signal
 
 STEPS = 200
 Array = NDArray[np.float64]

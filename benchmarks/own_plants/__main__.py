@@ -39,10 +39,10 @@ from plant import OwnPlant
 from store import bound_of, model_of
 from untouched import UNTOUCHED
 
-from pipeline.errors import PipelineError
-from pipeline.laws import LAWS
-from pipeline.laws.base import ControlLaw
-from pipeline.plants.spoilt import SpoiltPlant
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.plants.spoilt import SpoiltPlant
 
 ROWS, CLOSED_ROWS = 8_000, 12_000
 GROUPS = {

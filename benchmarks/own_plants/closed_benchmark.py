@@ -30,8 +30,8 @@ from loops import Steps, closed, scores
 from store import FOLDER, bound_of
 from torch import Tensor
 
-from pipeline.files import write_json
-from pipeline.laws.base import ControlLaw
+from loopwright.pipeline.files import write_json
+from loopwright.pipeline.laws.base import ControlLaw
 
 PLANTS: Mapping[str, type[ClosedPlant]] = {p.name: p for p in (*CLOSED_DEVELOPMENT, *CLOSED_UNTOUCHED)}
 TESTS = ("set points", "loads", "day")

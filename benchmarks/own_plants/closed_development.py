@@ -9,7 +9,7 @@ import casadi as ca
 from closed_plant import ClosedPlant, Measured, OldLoop, Wander
 from plant import column, lags, signal, states, valves
 
-from serving.manifest import Signal
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ import numpy as np
 from loops import HELD_OUT, LoopTest, tests_of
 from plant import OwnPlant
 
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario
 
 MOST = 2.2  # standard deviations that a wandering load reaches
 DAY = 1_500  # samples of a day's operation

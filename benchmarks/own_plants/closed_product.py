@@ -22,22 +22,22 @@ from loops import Steps
 from plant import OwnPlant
 from torch import Tensor
 
-from pipeline.commands import new
-from pipeline.commands.new_exported import asked, given_tags
-from pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
-from pipeline.historian.exported import screened_export, with_units
-from pipeline.historian.guessing import controlled_first
-from pipeline.historian.refusal import refusal
-from pipeline.historian.tags import named
-from pipeline.laws import LAWS
-from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.identified.structure_search import Searched
-from pipeline.models.part import Source
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record
-from serving.controller import Controller
-from serving.errors import OutputError
+from loopwright.pipeline.commands import new
+from loopwright.pipeline.commands.new_exported import asked, given_tags
+from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
+from loopwright.pipeline.historian.exported import screened_export, with_units
+from loopwright.pipeline.historian.guessing import controlled_first
+from loopwright.pipeline.historian.refusal import refusal
+from loopwright.pipeline.historian.tags import named
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.identified.structure_search import Searched
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import OutputError
 
 ROOT = Path(__file__).parents[2]
 PROJECT = ("dvc.yaml", ".dvcignore", ".gitignore", ".dvc/config", ".dvc/.gitignore")
@@ -222,6 +222,7 @@ def _fresh(project: Path) -> None:
     (project / ".dvc").mkdir(parents=True)
     for package in ("pipeline", "serving"):
         shutil.copytree(ROOT / package, project / package)
+    shutil.copytree(ROOT / "tools" / "roots", project / "tools" / "roots", symlinks=True)
     for name in PROJECT:
         shutil.copy(ROOT / name, project / name)
     subprocess.run(["git", "init", "--quiet"], check=True, cwd=project)
@@ -230,9 +231,12 @@ def _fresh(project: Path) -> None:
 
 def _loopwright(project: Path, *words: str) -> tuple[int, list[str]]:
     """Exit status of a command and the lines that it printed."""
-    own = {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(project)}
+    own = {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": str(project / "tools/roots"),
+    }
     done = subprocess.run(
-        [sys.executable, "-m", "pipeline", *words],
+        [sys.executable, "-m", "loopwright.pipeline", *words],
         cwd=project, env={**os.environ, **own}, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
     return done.returncode, [f"$ loopwright {' '.join(words)}", *done.stdout.splitlines()]

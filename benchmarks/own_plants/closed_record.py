@@ -14,7 +14,7 @@ from closed_plant import ClosedPlant, OldLoop, operated
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array
 
 START = datetime(2025, 2, 3, 0, 0, 0)
 IN_MANUAL = 0.085  # share of the rows, in the mean

@@ -23,8 +23,8 @@ from closed_record import ClosedRecord, closed_record_of, recorded, roles, write
 from numpy.typing import NDArray
 from store import FOLDER
 
-from pipeline.errors import PipelineError
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.plants.simulator import Array
 
 ROWS = 4_000
 MINUTES = 0.3  # of the search: the proof looks at answers, which are there early

@@ -10,8 +10,8 @@ import numpy as np
 from closed_plant import ClosedPlant, Measured, OldLoop, Wander
 from plant import column, lags, signal, states, valves
 
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True)

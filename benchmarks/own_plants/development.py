@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 from plant import OwnPlant, column, lags, signal, states, valves
 
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True)

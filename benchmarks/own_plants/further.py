@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import casadi as ca
 from plant import OwnPlant, column, lags, signal, states, valves
 
-from serving.manifest import Signal
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ import torch
 from plant import OwnPlant
 from torch import Tensor
 
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario
 
 HELD_OUT = (71, 72, 73)
 LEVELS = 8

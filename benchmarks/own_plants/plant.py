@@ -10,11 +10,11 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import root
 
-from pipeline.errors import PlantError
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.serving.manifest import Signal
 
 SETTLE = 3_000  # samples to come to rest
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from plant import OwnPlant
 
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 
 def record_of(plant: OwnPlant, rows: int, seed: int = 0) -> Record:

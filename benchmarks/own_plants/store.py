@@ -14,14 +14,14 @@ from loops import tests_of
 from plant import OwnPlant
 from record import record_of
 
-from pipeline.evaluation.effort import Effort
-from pipeline.files import write_bytes
-from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.part import Source
-from pipeline.optimal.perfect import PerfectNmpc, run_nmpc
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.files import write_bytes
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.optimal.perfect import PerfectNmpc, run_nmpc
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario
 
 FOLDER = Path(tempfile.gettempdir()) / "loopwright_own_plants"
 CODE = Path(__file__).parents[2] / "pipeline" / "models"

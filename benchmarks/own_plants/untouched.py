@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from plant import OwnPlant, column, lags, signal, states, valves
 
-from serving.manifest import Signal
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
-from pipeline.cases import CASES
+from loopwright.pipeline.cases import CASES
 
 ROWS, PERIOD_S = 5400, 2
 START = datetime(2024, 3, 4, 6, 0, tzinfo=UTC)

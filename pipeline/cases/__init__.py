@@ -10,19 +10,19 @@ import importlib
 import importlib.util
 from typing import Any
 
-from pipeline.cases.batch_reactor.case import BatchReactorCase
-from pipeline.cases.henson_seborg_cstr.case import HensonSeborgCstrCase
-from pipeline.cases.jacketed_batch_reactor.case import JacketedBatchReactorCase
-from pipeline.cases.own_plant import own_case
-from pipeline.cases.own_simulator import simulated_case
-from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
-from pipeline.cases.ph_neutralization.case_15s import PhNeutralization15sCase
-from pipeline.cases.reversible_cstr.case import ReversibleCstrCase
-from pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
-from pipeline.config.params import PARAMS_FILE, sections
-from pipeline.config.plants import PlantParams
-from pipeline.evaluation.case import Case
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.cases.batch_reactor.case import BatchReactorCase
+from loopwright.pipeline.cases.henson_seborg_cstr.case import HensonSeborgCstrCase
+from loopwright.pipeline.cases.jacketed_batch_reactor.case import JacketedBatchReactorCase
+from loopwright.pipeline.cases.own_plant import own_case
+from loopwright.pipeline.cases.own_simulator import simulated_case
+from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from loopwright.pipeline.cases.ph_neutralization.case_15s import PhNeutralization15sCase
+from loopwright.pipeline.cases.reversible_cstr.case import ReversibleCstrCase
+from loopwright.pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
+from loopwright.pipeline.config.params import PARAMS_FILE, sections
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.plants.simulator import Simulator
 
 CASES: dict[str, Case] = {
     ThiosulfateCstrCase.name: ThiosulfateCstrCase(),

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.evaluation.case import Array
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.records.record import Record
-from pipeline.records.set_points import stretches
+from loopwright.pipeline.evaluation.case import Array
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.records.set_points import stretches
 
 MOST, LEAST = 2_000, 200  # rows of a window
 ROWS = 6_000  # of all windows

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cases.reach import SCALES, TIMES, Reach, held_at
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.simulation.rests import courses
+from loopwright.pipeline.cases.reach import SCALES, TIMES, Reach, held_at
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.simulation.rests import courses
 
 LOAD = 0.25  # standard deviations of the record's CV
 ABOVE_NOISE = 3.0  # standard deviations of the CV's measurement noise, where these are more

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cases.loads import ROOM
-from pipeline.cases.reach import SCALES, VISITED_MV, held_at
-from pipeline.evaluation.case import Array
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.records.record import Record
+from loopwright.pipeline.cases.loads import ROOM
+from loopwright.pipeline.cases.reach import SCALES, VISITED_MV, held_at
+from loopwright.pipeline.evaluation.case import Array
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.records.record import Record
 
 
 def course(nominal: Array, place: int, level: float, samples: int, at: int) -> Array:

@@ -11,22 +11,22 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from pipeline.cases.own_model import Doubts, OwnPlant, doubted, suits
-from pipeline.cases.reach import Reach, visited_mv
-from pipeline.config.exports import is_exported
-from pipeline.errors import ModelError, PlantError, RecordError
-from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.grounds import RecordVerdict
-from pipeline.evaluation.model_evidence import Metrics, identified_part
-from pipeline.evaluation.one_side import before_turns, on_one_side
-from pipeline.files import read_json
-from pipeline.plants.identified import IdentifiedArrays
-from pipeline.plants.noise import deviation
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
-from pipeline.records.set_points import SetPoints
-from pipeline.simulation.rests import courses
+from loopwright.pipeline.cases.own_model import Doubts, OwnPlant, doubted, suits
+from loopwright.pipeline.cases.reach import Reach, visited_mv
+from loopwright.pipeline.config.exports import is_exported
+from loopwright.pipeline.errors import ModelError, PlantError, RecordError
+from loopwright.pipeline.evaluation.case import Array, Case
+from loopwright.pipeline.evaluation.grounds import RecordVerdict
+from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
+from loopwright.pipeline.evaluation.one_side import before_turns, on_one_side
+from loopwright.pipeline.files import read_json
+from loopwright.pipeline.plants.identified import IdentifiedArrays
+from loopwright.pipeline.plants.noise import deviation
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.records.set_points import SetPoints
+from loopwright.pipeline.simulation.rests import courses
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned

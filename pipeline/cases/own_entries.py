@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.cases.own_ensemble import LAW_PART, MODEL_SET
-from pipeline.config.exports import ExportParams, screened_record
-from pipeline.records.old_controller import OldController
+from loopwright.pipeline.cases.own_ensemble import LAW_PART, MODEL_SET
+from loopwright.pipeline.config.exports import ExportParams, screened_record
+from loopwright.pipeline.records.old_controller import OldController
 
 MEMBER_NUMBERS = (1, 2)
 OLD_LOOP = "old_loop"
@@ -25,7 +25,9 @@ def entries_of(
     These are two of ours, and with believed ``old`` ones of all controlled variables the loop that they make up. With
     ``export`` its files too, of which stage `screen` makes the record; without, ``plant`` says where that is.
     """
-    from pipeline.models.identified.structure_search import MINUTES  # here, because torch takes seconds to load
+    from loopwright.pipeline.models.identified.structure_search import (
+        MINUTES,  # here, because torch takes seconds to load
+    )
 
     # The default, written out: all members share one search, so that they must have the same number.
     minutes = {"minutes": MINUTES * min(len(plant["pv"]), len(plant["mv"]))}

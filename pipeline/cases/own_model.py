@@ -8,12 +8,12 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.historian.pace import MOST_PERIODS
-from pipeline.plants.identified import IdentifiedPlant, longest_memory
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.plants.spoilt import SpoiltPlant, likely_error
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.plants.identified import IdentifiedPlant, longest_memory
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.spoilt import SpoiltPlant, likely_error
 
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
 LEAST_GAIN, LEAST_PACE, LEAST_DEAD = 0.25, 0.25, 1.0

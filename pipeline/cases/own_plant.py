@@ -11,25 +11,25 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pipeline.cases.daily_work import LEAST, day, spread, windows
-from pipeline.cases.loads import held_load, load_size, whole_load
-from pipeline.cases.measured_steps import course, level_of
-from pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
-from pipeline.cases.own_entries import OLD_LOOP
-from pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
-from pipeline.cases.reach import TIMES
-from pipeline.config.known import together
-from pipeline.config.params import read_section, sections_of
-from pipeline.config.plants import MvParams, PlantParams, SignalParams
-from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.closed_loop import RANGE_BAND, closed_loop_metrics
-from pipeline.evaluation.knowing_control import gets_there
-from pipeline.evaluation.metric import METRICS, Metric
-from pipeline.metrics import mae
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.plants.signals import Signals
-from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
-from serving.manifest import Signal
+from loopwright.pipeline.cases.daily_work import LEAST, day, spread, windows
+from loopwright.pipeline.cases.loads import held_load, load_size, whole_load
+from loopwright.pipeline.cases.measured_steps import course, level_of
+from loopwright.pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
+from loopwright.pipeline.cases.own_entries import OLD_LOOP
+from loopwright.pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
+from loopwright.pipeline.cases.reach import TIMES
+from loopwright.pipeline.config.known import together
+from loopwright.pipeline.config.params import read_section, sections_of
+from loopwright.pipeline.config.plants import MvParams, PlantParams, SignalParams
+from loopwright.pipeline.evaluation.case import Array, Case
+from loopwright.pipeline.evaluation.closed_loop import RANGE_BAND, closed_loop_metrics
+from loopwright.pipeline.evaluation.knowing_control import gets_there
+from loopwright.pipeline.evaluation.metric import METRICS, Metric
+from loopwright.pipeline.metrics import mae
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from loopwright.serving.manifest import Signal
 
 LOAD_AT = 5  # sample at which a load or a step of a measured disturbance begins
 SPOILT = "spoilt"  # the test on models gone wrong

@@ -9,14 +9,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.cases.loads import ROOM, load_size
-from pipeline.cases.own_plant import LOADED, OwnCase, own_case
-from pipeline.config.plants import PlantParams
-from pipeline.errors import ParamsError
-from pipeline.evaluation.case import Array, Case
-from pipeline.plants.simulator import Simulator
-from pipeline.plants.simulator_file import FileSimulator, files_of
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.cases.loads import ROOM, load_size
+from loopwright.pipeline.cases.own_plant import LOADED, OwnCase, own_case
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.evaluation.case import Array, Case
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator_file import FileSimulator, files_of
+from loopwright.pipeline.simulation.scenario import Scenario
 
 LOADS = "load_"  # at the start of a parameter that is a load
 APART = "spoilt"  # a test that needs errors of gain and dead time, which a simulator does not offer: on models

@@ -9,12 +9,12 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.case import Array
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
-from pipeline.simulation.rests import BALANCED, RESTING, balanced, courses, inside, settled
-from serving.manifest import Signal
+from loopwright.pipeline.evaluation.case import Array
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.rests import BALANCED, RESTING, balanced, courses, inside, settled
+from loopwright.serving.manifest import Signal
 
 VISITED_MV, VISITED_CV = (0.1, 0.9), (0.01, 0.99)  # quantiles of the record between which tests move
 LEAST_VISITED = 0.05  # of an MV's commanded range, where that cuts the visited one

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import NoReturn
 
-from serving import arguments
+from loopwright.serving import arguments
 
 COMMANDS = {
     "new": "make a record of a historian's export: read, screened, judged, and added to params.yaml",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from serving.__main__ import bench_options as options
-from serving.__main__ import run_bench as run
+from loopwright.serving.__main__ import bench_options as options
+from loopwright.serving.__main__ import run_bench as run
 
 __all__ = ["options", "run"]

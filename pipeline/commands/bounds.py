@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from pipeline.cases import CASES
-from pipeline.commands.arguments import whole
-from pipeline.config.params import choose
-from pipeline.engine.cluster import workers_here
-from pipeline.stages.bounds import compute
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.commands.arguments import whole
+from loopwright.pipeline.config.params import choose
+from loopwright.pipeline.engine.cluster import workers_here
+from loopwright.pipeline.stages.bounds import compute
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 
-from pipeline.config.params import sections
-from pipeline.stages.check import CHECKS, mistakes, notes
+from loopwright.pipeline.config.params import sections
+from loopwright.pipeline.stages.check import CHECKS, mistakes, notes
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -7,12 +7,12 @@ import os
 import tempfile
 from pathlib import Path
 
-from pipeline.errors import HostError
-from pipeline.files import draft_of
-from pipeline.hosts.fmu.compiling import toolchain
-from pipeline.hosts.fmu.folder import pack, write_folder
-from pipeline.hosts.fmu.gate import check, problems
-from serving.controller import Controller
+from loopwright.pipeline.errors import HostError
+from loopwright.pipeline.files import draft_of
+from loopwright.pipeline.hosts.fmu.compiling import toolchain
+from loopwright.pipeline.hosts.fmu.folder import pack, write_folder
+from loopwright.pipeline.hosts.fmu.gate import check, problems
+from loopwright.serving.controller import Controller
 
 MEGABYTE = 1e6
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from pipeline.commands.parameters import list_or_show
-from pipeline.laws import LAWS
+from loopwright.pipeline.commands.parameters import list_or_show
+from loopwright.pipeline.laws import LAWS
 
 
 def options(parser: argparse.ArgumentParser) -> None:

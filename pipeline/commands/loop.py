@@ -1,5 +1,5 @@
-"""``loopwright loop``: a controller on a real plant, over OPC UA; see ``serving.station``."""
+"""``loopwright loop``: a controller on a real plant, over OPC UA; see ``loopwright.serving.station``."""
 
-from serving.station.command import options, run
+from loopwright.serving.station.command import options, run
 
 __all__ = ["options", "run"]

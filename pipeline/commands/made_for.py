@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pipeline.errors import ParamsError
-from pipeline.plants.simulator import Simulator
-from serving.manifest import Manifest
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.serving.manifest import Manifest
 
 
 def require_made_for(manifest: Manifest, plant: Simulator) -> None:

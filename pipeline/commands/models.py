@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from pipeline.commands.parameters import first_sentence, list_or_show
-from pipeline.models import MODELS
+from loopwright.pipeline.commands.parameters import first_sentence, list_or_show
+from loopwright.pipeline.models import MODELS
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -12,34 +12,34 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases.own_entries import entries_of
-from pipeline.commands.arguments import positive, whole
-from pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
-from pipeline.commands.new_exported import asked, given_tags, loop_lines, propose_tags
-from pipeline.commands.new_fmu import table_from, write_table
-from pipeline.commands.new_known import signals_as_tags, stated_of
-from pipeline.commands.new_printed import tell
-from pipeline.commands.new_replaced import REFUSED, check_replaceable, known_kept, limits_kept, wishes_lost
-from pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
-from pipeline.config.entries import add_entries
-from pipeline.config.exports import ExportParams
-from pipeline.config.params import sections
-from pipeline.config.plants import check_name
-from pipeline.errors import PipelineError, RecordError
-from pipeline.files import draft_folder_of, write_json, write_text
-from pipeline.historian.excerpt import evenly
-from pipeline.historian.exported import screened_export, with_units
-from pipeline.historian.guessing import controlled_first
-from pipeline.historian.known_record import beside_record
-from pipeline.historian.refusal import Refusal, refusal
-from pipeline.historian.screening import Screened
-from pipeline.historian.step_test import planned
-from pipeline.historian.tags import RANGES, ROLES, TableError, Tag, limited, named
-from pipeline.plants.simulator_file import FileSimulator, is_fmu
-from pipeline.records.record import Record
-from pipeline.report.screening import write_page
-from pipeline.stages.paths import DATA, WORK
-from serving.words import plain
+from loopwright.pipeline.cases.own_entries import entries_of
+from loopwright.pipeline.commands.arguments import positive, whole
+from loopwright.pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
+from loopwright.pipeline.commands.new_exported import asked, given_tags, loop_lines, propose_tags
+from loopwright.pipeline.commands.new_fmu import table_from, write_table
+from loopwright.pipeline.commands.new_known import signals_as_tags, stated_of
+from loopwright.pipeline.commands.new_printed import tell
+from loopwright.pipeline.commands.new_replaced import REFUSED, check_replaceable, known_kept, limits_kept, wishes_lost
+from loopwright.pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
+from loopwright.pipeline.config.entries import add_entries
+from loopwright.pipeline.config.exports import ExportParams
+from loopwright.pipeline.config.params import sections
+from loopwright.pipeline.config.plants import check_name
+from loopwright.pipeline.errors import PipelineError, RecordError
+from loopwright.pipeline.files import draft_folder_of, write_json, write_text
+from loopwright.pipeline.historian.excerpt import evenly
+from loopwright.pipeline.historian.exported import screened_export, with_units
+from loopwright.pipeline.historian.guessing import controlled_first
+from loopwright.pipeline.historian.known_record import beside_record
+from loopwright.pipeline.historian.refusal import Refusal, refusal
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.step_test import planned
+from loopwright.pipeline.historian.tags import RANGES, ROLES, TableError, Tag, limited, named
+from loopwright.pipeline.plants.simulator_file import FileSimulator, is_fmu
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.report.screening import write_page
+from loopwright.pipeline.stages.paths import DATA, WORK
+from loopwright.serving.words import plain
 
 LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
 WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",

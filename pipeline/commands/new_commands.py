@@ -6,12 +6,12 @@ import shlex
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
-from pipeline.config.plants import mistakes_of_mv
-from pipeline.errors import RecordError
-from pipeline.historian.findings import InputReport
-from pipeline.historian.tags import Tag, commanded_range
-from pipeline.plants.simulator import Simulator
-from serving.manifest import Signal
+from loopwright.pipeline.config.plants import mistakes_of_mv
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.findings import InputReport
+from loopwright.pipeline.historian.tags import Tag, commanded_range
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.serving.manifest import Signal
 
 
 def mvs_of(plant: Simulator) -> tuple[Tag, ...]:

@@ -8,15 +8,15 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-from pipeline.commands.new_widened import Widening
-from pipeline.config.exports import ExportParams
-from pipeline.config.intervals import Interval
-from pipeline.errors import RecordError
-from pipeline.historian.exported import exported
-from pipeline.historian.findings import counted
-from pipeline.historian.guessing import guesses, loops_in
-from pipeline.historian.reading import read_export, tags_in, units_of
-from pipeline.historian.tags import (
+from loopwright.pipeline.commands.new_widened import Widening
+from loopwright.pipeline.config.exports import ExportParams
+from loopwright.pipeline.config.intervals import Interval
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.exported import exported
+from loopwright.pipeline.historian.findings import counted
+from loopwright.pipeline.historian.guessing import guesses, loops_in
+from loopwright.pipeline.historian.reading import read_export, tags_in, units_of
+from loopwright.pipeline.historian.tags import (
     EXPLAINED,
     ROLES,
     Tag,
@@ -27,7 +27,7 @@ from pipeline.historian.tags import (
     read_tags,
     write_tags,
 )
-from serving.words import plain
+from loopwright.serving.words import plain
 
 
 def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pipeline.errors import RecordError
-from pipeline.historian.tags import SIGNAL_ROLES, Guess, Tag, named, write_tags
-from pipeline.plants.fmu.description import Description, Variable, described
-from pipeline.plants.fmu.program import variable_of
-from pipeline.plants.fmu.table import FmuRow, FmuTable
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.tags import SIGNAL_ROLES, Guess, Tag, named, write_tags
+from loopwright.pipeline.plants.fmu.description import Description, Variable, described
+from loopwright.pipeline.plants.fmu.program import variable_of
+from loopwright.pipeline.plants.fmu.table import FmuRow, FmuTable
 
 PROPOSED = {"input": "mv", "output": "pv"}
 MISSING = "give its range"

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from pipeline.config.known import FORMS, Known, stated, together
-from pipeline.config.plants import mistake_of_known
-from pipeline.errors import RecordError, nearest
-from pipeline.historian.tags import TableError, Tag
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
+from loopwright.pipeline.config.known import FORMS, Known, stated, together
+from loopwright.pipeline.config.plants import mistake_of_known
+from loopwright.pipeline.errors import RecordError, nearest
+from loopwright.pipeline.historian.tags import TableError, Tag
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.records.record import Record
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from pipeline.config.known import Known
-from pipeline.historian.excitation import HELD
-from pipeline.historian.findings import InputReport, Screening, Verdict, counted
-from pipeline.historian.pace import in_words
-from pipeline.historian.step_test import StepTest
-from pipeline.pictures.drawing import axis_label, ratio_unit
-from serving.words import plain
+from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.historian.excitation import HELD
+from loopwright.pipeline.historian.findings import InputReport, Screening, Verdict, counted
+from loopwright.pipeline.historian.pace import in_words
+from loopwright.pipeline.historian.step_test import StepTest
+from loopwright.pipeline.pictures.drawing import axis_label, ratio_unit
+from loopwright.serving.words import plain
 
 
 def tell(

@@ -8,16 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.cases import CASES
-from pipeline.cases.own_entries import entries_of
-from pipeline.commands.new_known import Stated, checked
-from pipeline.commands.new_simulated import SIMULATOR
-from pipeline.config.known import Known, together
-from pipeline.config.params import read_section, sections
-from pipeline.config.plants import PlantParams
-from pipeline.errors import RecordError
-from pipeline.historian.tags import COMMANDS, Tag
-from pipeline.records.old_controller import OldController
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.own_entries import entries_of
+from loopwright.pipeline.commands.new_known import Stated, checked
+from loopwright.pipeline.commands.new_simulated import SIMULATOR
+from loopwright.pipeline.config.known import Known, together
+from loopwright.pipeline.config.params import read_section, sections
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.tags import COMMANDS, Tag
+from loopwright.pipeline.records.old_controller import OldController
 
 REFUSED = {"screening.json", "screening.html", "step_test.csv"}  # all that is left of an export that was not added
 OWN = {*REFUSED, "record.parquet", "first_test.json"}  # what is written for a plant, beside its simulator

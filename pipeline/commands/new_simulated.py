@@ -6,15 +6,15 @@ import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from pipeline.errors import RecordError
-from pipeline.excitation.first_test import FirstTest, first_test
-from pipeline.excitation.planned import Plan, excited, planned
-from pipeline.files import sha256, write_json
-from pipeline.historian.findings import Finding
-from pipeline.historian.made import judged_record
-from pipeline.historian.screening import Screened
-from pipeline.plants.fmu.table import FmuTable
-from pipeline.plants.simulator_file import FileSimulator
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.excitation.first_test import FirstTest, first_test
+from loopwright.pipeline.excitation.planned import Plan, excited, planned
+from loopwright.pipeline.files import sha256, write_json
+from loopwright.pipeline.historian.findings import Finding
+from loopwright.pipeline.historian.made import judged_record
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.plants.fmu.table import FmuTable
+from loopwright.pipeline.plants.simulator_file import FileSimulator
 
 SLOW, WANTED = 120, 60  # periods of the settling time: above the first, the period becomes long enough for the second
 LONGER = (10, 100, 1000)  # steps of a simulator in a period, tried where it does not settle

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, field, replace
 
-from pipeline.historian.guessing import seen_range
-from pipeline.historian.reading import read_export
-from pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.guessing import seen_range
+from loopwright.pipeline.historian.reading import read_export
+from loopwright.pipeline.historian.tags import Tag
 
 
 @dataclass(slots=True)

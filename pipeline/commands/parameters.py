@@ -11,7 +11,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.config.params import choose
+from loopwright.pipeline.config.params import choose
 
 WIDTH = 110
 

@@ -8,13 +8,13 @@ import logging
 import sys
 from pathlib import Path
 
-from pipeline.cases import CASES, all_cases
-from pipeline.commands.arguments import positive, whole
-from pipeline.config.params import choose
-from pipeline.errors import PipelineError, PlantError
-from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.model_evidence import IDENTIFIED
-from pipeline.simulation.faults import FAULTS
+from loopwright.pipeline.cases import CASES, all_cases
+from loopwright.pipeline.commands.arguments import positive, whole
+from loopwright.pipeline.config.params import choose
+from loopwright.pipeline.errors import PipelineError, PlantError
+from loopwright.pipeline.evaluation.case import Array, Case
+from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
+from loopwright.pipeline.simulation.faults import FAULTS
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -64,7 +64,7 @@ def start_of(case: Case) -> tuple[Array, Array]:
 
 def run(options: argparse.Namespace) -> None:
     """Serve the plant until Ctrl-C, or spoil a signal of one that is served."""
-    from pipeline.simulation.opcua_server import PlantServer, spoil
+    from loopwright.pipeline.simulation.opcua_server import PlantServer, spoil
 
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)  # what went wrong is said below, in a line
     if options.action == "fault":

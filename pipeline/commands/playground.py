@@ -7,18 +7,18 @@ import sys
 import tempfile
 from pathlib import Path
 
-from pipeline.cases import all_cases
-from pipeline.commands.arguments import whole
-from pipeline.commands.made_for import require_made_for
-from pipeline.config.params import choose
-from pipeline.errors import ParamsError
-from pipeline.evaluation.case import Case
-from pipeline.export.plant_graphs import plant_graphs
-from pipeline.playground.about import about, validation_of
-from pipeline.playground.server import HOST, file_server
-from pipeline.playground.site import Playground, write_folder, write_one_file
-from pipeline.playground.web_runtime import web_runtime
-from serving.controller import Controller
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.commands.arguments import whole
+from loopwright.pipeline.commands.made_for import require_made_for
+from loopwright.pipeline.config.params import choose
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.export.plant_graphs import plant_graphs
+from loopwright.pipeline.playground.about import about, validation_of
+from loopwright.pipeline.playground.server import HOST, file_server
+from loopwright.pipeline.playground.site import Playground, write_folder, write_one_file
+from loopwright.pipeline.playground.web_runtime import web_runtime
+from loopwright.serving.controller import Controller
 
 PORT = 8123
 ALL = "all"

@@ -10,12 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import quote
 
-from pipeline.errors import TrackingError
-from pipeline.tracking.publish import publish
-from pipeline.tracking.registry import CHAMPION, fetch, promote, registered, versions
-from pipeline.tracking.signing import trusted, words
-from pipeline.tracking.store import store, store_uri
-from serving.words import plain
+from loopwright.pipeline.errors import TrackingError
+from loopwright.pipeline.tracking.publish import publish
+from loopwright.pipeline.tracking.registry import CHAMPION, fetch, promote, registered, versions
+from loopwright.pipeline.tracking.signing import trusted, words
+from loopwright.pipeline.tracking.store import store, store_uri
+from loopwright.serving.words import plain
 
 HOST = "127.0.0.1"
 CHAMPIONS = "tags.standing LIKE 'champion%'"

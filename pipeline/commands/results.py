@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.report.results import show_results
+from loopwright.pipeline.report.results import show_results
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -13,15 +13,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.config.params import entries, sections, sections_of
-from pipeline.engine.dvc import affected, ask, ask_in_turn, environment
-from pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
-from pipeline.engine.start import STAGES as KINDS
-from pipeline.errors import ParamsError, PipelineError, nearest
-from pipeline.report.results import show_results, without_controller
-from pipeline.stages.check import mistakes
-from pipeline.stages.code import code as list_files
-from pipeline.stages.overview import brought_up
+from loopwright.pipeline.config.params import entries, sections, sections_of
+from loopwright.pipeline.engine.dvc import affected, ask, ask_in_turn, environment
+from loopwright.pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
+from loopwright.pipeline.engine.start import STAGES as KINDS
+from loopwright.pipeline.errors import ParamsError, PipelineError, nearest
+from loopwright.pipeline.report.results import show_results, without_controller
+from loopwright.pipeline.stages.check import mistakes
+from loopwright.pipeline.stages.code import code as list_files
+from loopwright.pipeline.stages.overview import brought_up
 
 ARTIFACTS = Path("artifacts")
 MANY = 25  # stages that a person does not read line by line
@@ -111,7 +111,7 @@ def repro(targets: Sequence[str], changed: Iterable[str], expected: Sequence[str
         work = [*([] if targets else ["--rest"]), *(",".join(chain) for chain in chains)]
     else:
         work = ["repro", *(["--keep-going"] if keep_going else []), *targets]
-    lanes = [sys.executable, "-m", "pipeline.engine.lanes", "--of", ",".join(expected), *work]
+    lanes = [sys.executable, "-m", "loopwright.pipeline.engine.lanes", "--of", ",".join(expected), *work]
     own, asked, running = os.getpid(), list[int](), list[subprocess.Popen[bytes]]()
 
     def begin() -> None:
@@ -125,7 +125,7 @@ def repro(targets: Sequence[str], changed: Iterable[str], expected: Sequence[str
 
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        command = [sys.executable, "-m", "pipeline.engine.with_cluster", *lanes]
+        command = [sys.executable, "-m", "loopwright.pipeline.engine.with_cluster", *lanes]
         kinds = ",".join(dict.fromkeys(stage.partition("@")[0] for stage in expected))
         with subprocess.Popen(command, env={**environment(), KINDS: kinds}, preexec_fn=begin) as process:
             running.append(process)

@@ -1,6 +1,6 @@
-"""``loopwright sign``: say who made a controller file; see ``serving.signing``."""
+"""``loopwright sign``: say who made a controller file; see ``loopwright.serving.signing``."""
 
-from serving.signing.command import run_sign as run
-from serving.signing.command import sign_options as options
+from loopwright.serving.signing.command import run_sign as run
+from loopwright.serving.signing.command import sign_options as options
 
 __all__ = ["options", "run"]

@@ -12,25 +12,25 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from pipeline.cases import PLANTS, all_cases
-from pipeline.commands.arguments import positive, real, whole
-from pipeline.commands.made_for import require_made_for
-from pipeline.config.params import choose
-from pipeline.errors import ParamsError, nearest
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.metric import METRICS
-from pipeline.evaluation.model_evidence import IDENTIFIED
-from pipeline.pictures.loop_picture import History, draw, summary, write_csv
-from pipeline.plants.simulator import Simulator
-from pipeline.simulation.live import SimulatedPlant, view_of
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.timetable import Timetable, parse_event, parse_manual, timetable
-from serving.clock import MonotonicClock, VirtualClock
-from serving.controller import Controller
-from serving.endpoint import Array
-from serving.guard import Sample
-from serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
-from serving.manifest import Manifest
+from loopwright.pipeline.cases import PLANTS, all_cases
+from loopwright.pipeline.commands.arguments import positive, real, whole
+from loopwright.pipeline.commands.made_for import require_made_for
+from loopwright.pipeline.config.params import choose
+from loopwright.pipeline.errors import ParamsError, nearest
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.metric import METRICS
+from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
+from loopwright.pipeline.pictures.loop_picture import History, draw, summary, write_csv
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.simulation.live import SimulatedPlant, view_of
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.timetable import Timetable, parse_event, parse_manual, timetable
+from loopwright.serving.clock import MonotonicClock, VirtualClock
+from loopwright.serving.controller import Controller
+from loopwright.serving.endpoint import Array
+from loopwright.serving.guard import Sample
+from loopwright.serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
+from loopwright.serving.manifest import Manifest
 
 RECOVER_AFTER = 5  # good samples
 P = ParamSpec("P")

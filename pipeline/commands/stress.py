@@ -9,21 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.cases import all_cases
-from pipeline.commands.arguments import real, whole
-from pipeline.commands.made_for import require_made_for
-from pipeline.engine.cluster import address, workers_here
-from pipeline.engine.parallel import parallel_map
-from pipeline.errors import ParamsError, nearest
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.stress.draws import Drawing
-from pipeline.evaluation.stress.loops import Outcome, Stress, figures_of, opened
-from pipeline.evaluation.stress.summary import Summary
-from pipeline.pictures.numbers import number
-from pipeline.pictures.png import save
-from pipeline.pictures.stress_pictures import loop_canvas
-from pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
-from serving.manifest import Manifest
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.commands.arguments import real, whole
+from loopwright.pipeline.commands.made_for import require_made_for
+from loopwright.pipeline.engine.cluster import address, workers_here
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.errors import ParamsError, nearest
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.stress.draws import Drawing
+from loopwright.pipeline.evaluation.stress.loops import Outcome, Stress, figures_of, opened
+from loopwright.pipeline.evaluation.stress.summary import Summary
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.png import save
+from loopwright.pipeline.pictures.stress_pictures import loop_canvas
+from loopwright.pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
+from loopwright.serving.manifest import Manifest
 
 PLANTS, SEED, SPREAD, FAULTS, BATCH = 1000, 0, 2.0, 50.0, 100
 FEW = 500  # loops that are done before workers have started

@@ -1,6 +1,6 @@
-"""``loopwright verify``: who made a controller file; see ``serving.signing``."""
+"""``loopwright verify``: who made a controller file; see ``loopwright.serving.signing``."""
 
-from serving.signing.command import run_verify as run
-from serving.signing.command import verify_options as options
+from loopwright.serving.signing.command import run_verify as run
+from loopwright.serving.signing.command import verify_options as options
 
 __all__ = ["options", "run"]

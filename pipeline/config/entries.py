@@ -10,10 +10,10 @@ from typing import Any
 
 import yaml
 
-from pipeline.config.params import PARAMS_FILE
-from pipeline.config.reading import tree_of
-from pipeline.errors import ParamsError
-from pipeline.files import write_bytes
+from loopwright.pipeline.config.params import PARAMS_FILE
+from loopwright.pipeline.config.reading import tree_of
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.files import write_bytes
 
 Entries = Mapping[str, Mapping[str, Any]]
 """Section -> name of the entry -> its values."""

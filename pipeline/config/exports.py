@@ -7,9 +7,9 @@ import math
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline.config.intervals import Interval
-from pipeline.config.params import PARAMS_FILE, parse, read_section, sections
-from pipeline.errors import ParamsError
+from loopwright.pipeline.config.intervals import Interval
+from loopwright.pipeline.config.params import PARAMS_FILE, parse, read_section, sections
+from loopwright.pipeline.errors import ParamsError
 
 SECTION = "exports"
 SCREENED = "screened"  # the name of the record

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pipeline.config.reading import tree_of
-from pipeline.errors import ParamsError, nearest
-from serving import fields
+from loopwright.pipeline.config.reading import tree_of
+from loopwright.pipeline.errors import ParamsError, nearest
+from loopwright.serving import fields
 
 T = TypeVar("T")
 PARAMS_FILE = Path("params.yaml")
@@ -82,7 +82,7 @@ def choose(table: Mapping[str, T], word: object, what: str, where: str = "") -> 
 
 
 def parse(cls: type[T], values: Mapping[str, Any], where: str) -> T:
-    """``values`` as the dataclass ``cls``; ParamsError, see ``serving.fields``."""
+    """``values`` as the dataclass ``cls``; ParamsError, see ``loopwright.serving.fields``."""
     return fields.parse(cls, values, where, ParamsError)
 
 

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from pipeline.config.exports import is_exported, screened_record
-from pipeline.config.known import NONE, Known, together
-from pipeline.config.params import PARAMS_FILE, parse, read_section, sections
-from pipeline.errors import ParamsError, nearest
+from loopwright.pipeline.config.exports import is_exported, screened_record
+from loopwright.pipeline.config.known import NONE, Known, together
+from loopwright.pipeline.config.params import PARAMS_FILE, parse, read_section, sections
+from loopwright.pipeline.errors import ParamsError, nearest
 
 SECTION = "plants"
 NAME = re.compile(r"^[a-z][a-z0-9_]{0,63}$")

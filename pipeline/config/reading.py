@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
-from pipeline.errors import ParamsError, nearest
-from serving.plain_values import MAX_DIGITS
+from loopwright.pipeline.errors import ParamsError, nearest
+from loopwright.serving.plain_values import MAX_DIGITS
 
 SECTIONS = ("cases", "exports", "records", "models", "plants", "controllers")
 OWN = "x-"  # a key that begins so is the user's, for values that aliases repeat

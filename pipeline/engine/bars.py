@@ -13,7 +13,7 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from pipeline.engine.spoken import MARK
+from loopwright.pipeline.engine.spoken import MARK
 
 
 class Bars:

@@ -13,7 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-from pipeline.errors import PipelineError
+from loopwright.pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -22,7 +22,7 @@ ADDRESS = "DASK_SCHEDULER_ADDRESS"
 WORKERS = "LOOPWRIGHT_WORKERS"  # how many a cluster of this machine has where nobody says it; unset: one a core
 CONNECT_S = 20.0
 WORKERS_S = 120.0  # for the first worker, whose libraries take some seconds
-PRELOAD = ["pipeline.engine.preload"]
+PRELOAD = ["loopwright.pipeline.engine.preload"]
 # What workers have in their environment before they start. They keep memory that is freed: Dask has them give it back
 # to the system at once, and the pages that it then has to clear anew took up to a third of a training's time.
 MEMORY = {

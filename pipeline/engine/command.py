@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 
 from numpy.linalg import LinAlgError
 
-from serving.arguments import write_any_text
-from serving.errors import LoopwrightError
-from serving.words import plain
+from loopwright.serving.arguments import write_any_text
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.words import plain
 
 FAILURES = (LoopwrightError, OSError, LinAlgError)
 """Errors that bad input can raise: one line on standard error, exit status 2."""
@@ -27,14 +27,14 @@ def reason(error: Exception) -> str:
 
 
 def run_stage(stage: Callable[..., None], argv: Sequence[str], what: str = "") -> int:
-    """Run ``python -m pipeline.stages.X [NAME]``; the exit status: 2 and one line where it could not.
+    """Run ``python -m loopwright.pipeline.stages.X [NAME]``; the exit status: 2 and one line where it could not.
 
     ``what`` says what NAME names; a stage over all cases takes none.
     """
     write_any_text()
     program, names = stage.__name__, list(argv[1:])
     if len(names) != bool(what) or any(name.startswith("-") for name in names):
-        print(f"usage: python -m pipeline.stages.{program} {what}".rstrip(), file=sys.stderr)
+        print(f"usage: python -m loopwright.pipeline.stages.{program} {what}".rstrip(), file=sys.stderr)
         return 2
     try:
         stage(*names)

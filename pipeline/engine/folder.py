@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Self
 
-from pipeline.files import write_bytes
+from loopwright.pipeline.files import write_bytes
 
 Files = Mapping[str, bytes]
 Changes = Mapping[str, bytes | None]  # None: removed

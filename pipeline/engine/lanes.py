@@ -1,4 +1,6 @@
-"""``python -m pipeline.engine.lanes [--of STAGE,...] [--rest] STAGE,STAGE,... ...``: chains of stages side by side.
+"""Chains of stages side by side: ``python -m loopwright.pipeline.engine.lanes [--of STAGE,...] [--rest] CHAIN ...``.
+
+A chain is STAGE,STAGE,....
 
 DVC runs one stage after another, and in each there is a while in which a core has nothing to do: imports, a single
 data seed, DVC's own files. Chains that share no output fill it. Each lane takes the next chain and has a ``dvc repro``
@@ -6,7 +8,7 @@ of its own run its stages in their order, up to the first that fails; the stages
 must be up to date. With ``--rest`` one more ``dvc repro`` then runs whatever is left. A chain that fails ends the run
 once those beside it have ended. Results are those of one lane.
 
-``python -m pipeline.engine.lanes [--of STAGE,...] repro ARGUMENT...`` is one ``dvc repro ARGUMENT...``.
+``python -m loopwright.pipeline.engine.lanes [--of STAGE,...] repro ARGUMENT...`` is one ``dvc repro ARGUMENT...``.
 
 The output of the lanes comes line by line, with each stage announced by its number among those ``of``
 which the run may have to run. After SIGINT or SIGTERM no line comes any more, and no stage begins. DVC itself is not
@@ -30,12 +32,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from pipeline.engine.announcements import Announcements, words_of
-from pipeline.engine.bars import Bars
-from pipeline.engine.dvc import COMMAND, environment
-from pipeline.engine.lifeline import end_with_parent
-from pipeline.engine.spoken import BARS
-from pipeline.engine.start import DOOR
+from loopwright.pipeline.engine.announcements import Announcements, words_of
+from loopwright.pipeline.engine.bars import Bars
+from loopwright.pipeline.engine.dvc import COMMAND, environment
+from loopwright.pipeline.engine.lifeline import end_with_parent
+from loopwright.pipeline.engine.spoken import BARS
+from loopwright.pipeline.engine.start import DOOR
 
 LANES = 2  # more fill no core further: a stage's pieces already go to every worker
 GRACE_S = 15.0  # in which DVC ends by itself
@@ -43,7 +45,7 @@ GRACE_S = 15.0  # in which DVC ends by itself
 
 def main(argv: Sequence[str]) -> int:
     """Run the chains, then the rest if asked; the exit status of the first failure, or 0."""
-    parser = argparse.ArgumentParser(prog="python -m pipeline.engine.lanes")
+    parser = argparse.ArgumentParser(prog="python -m loopwright.pipeline.engine.lanes")
     parser.add_argument("--of", metavar="STAGE,...", type=lambda names: names.split(","), default=[])
     parser.add_argument("--rest", action="store_true", help="run whatever is left after the chains")
     parser.add_argument("work", metavar="STAGE,...", nargs="+", help="chains, or repro and its arguments")

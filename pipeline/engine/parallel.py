@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import cloudpickle
 
-from pipeline.engine.cluster import address, connected
-from pipeline.engine.fingerprint import fingerprint
-from pipeline.engine.folder import Changes, Files, apply
-from pipeline.engine.pieces import Task, alone, current_task, on_worker
-from pipeline.engine.progress import piece, progress_bar, within
-from pipeline.errors import PipelineError
+from loopwright.pipeline.engine.cluster import address, connected
+from loopwright.pipeline.engine.fingerprint import fingerprint
+from loopwright.pipeline.engine.folder import Changes, Files, apply
+from loopwright.pipeline.engine.pieces import Task, alone, current_task, on_worker
+from loopwright.pipeline.engine.progress import piece, progress_bar, within
+from loopwright.pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-from pipeline.engine.fingerprint import difference, fingerprint
-from pipeline.engine.folder import Files, Folder
-from pipeline.engine.preload import unwatched
-from pipeline.engine.progress import lines_anew
-from pipeline.errors import PipelineError
+from loopwright.pipeline.engine.fingerprint import difference, fingerprint
+from loopwright.pipeline.engine.folder import Files, Folder
+from loopwright.pipeline.engine.preload import unwatched
+from loopwright.pipeline.engine.progress import lines_anew
+from loopwright.pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
     from distributed import Worker

@@ -1,4 +1,4 @@
-"""Libraries loaded by a worker that waits: ``dask worker ADDRESS --nthreads 1 --preload pipeline.engine.preload``.
+"""Libraries that a worker loads while it waits: ``dask worker ADDRESS --preload loopwright.pipeline.engine.preload``.
 
 torch, casadi, pandas and the like take a stage longer to import than most take to work. A worker begins with them as it
 starts and goes on whenever it is idle, so that a task waits for one of them at most. A worker of this machine's own
@@ -17,9 +17,9 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from pipeline.engine.fingerprint import fingerprint
-from pipeline.engine.spoken import listen
-from pipeline.engine.start import STAGES
+from loopwright.pipeline.engine.fingerprint import fingerprint
+from loopwright.pipeline.engine.spoken import listen
+from loopwright.pipeline.engine.start import STAGES
 
 if TYPE_CHECKING:
     from distributed import Worker
@@ -44,9 +44,9 @@ OF_KIND = {
 IDLE_S = 0.05  # until a worker that has a task looks again whether it may go on importing
 PROFILING = ("profile", "profile-cycle")
 # The ends of the pipeline that no worker runs.
-APART = (
-    *("pipeline.__main__", "pipeline.commands", "pipeline.tracking", "pipeline.stages.publish", "pipeline.playground"),
-    *("pipeline.hosts", "pipeline.simulation.opcua_server"),
+APART = tuple(
+    f"loopwright.pipeline.{name}"
+    for name in ("__main__", "commands", "tracking", "stages.publish", "playground", "hosts", "simulation.opcua_server")
 )
 
 
@@ -113,13 +113,13 @@ def _needed(kinds: Sequence[str]) -> Iterator[str]:
     """The libraries of some kinds of stages, in the usual order, and the stages themselves."""
     needed = {name for kind in kinds for name in OF_KIND[kind]}
     yield from (name for name in LIBRARIES if name in needed)
-    yield from (f"pipeline.stages.{kind}" for kind in kinds if OF_KIND[kind])
+    yield from (f"loopwright.pipeline.stages.{kind}" for kind in kinds if OF_KIND[kind])
 
 
 def _everything() -> Iterator[str]:
     yield from LIBRARIES
-    import pipeline
+    from loopwright import pipeline
 
-    for module in pkgutil.walk_packages(pipeline.__path__, "pipeline.", onerror=lambda _: None):
+    for module in pkgutil.walk_packages(pipeline.__path__, f"{pipeline.__name__}.", onerror=lambda _: None):
         if not module.name.startswith(APART):
             yield module.name

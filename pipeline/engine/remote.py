@@ -15,12 +15,12 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.engine.cluster import connected
-from pipeline.engine.fingerprint import difference, fingerprint
-from pipeline.engine.folder import Folder, apply, read_files
-from pipeline.engine.origin import commit, told
-from pipeline.engine.spoken import BARS
-from pipeline.engine.stage_files import StageFiles
+from loopwright.pipeline.engine.cluster import connected
+from loopwright.pipeline.engine.fingerprint import difference, fingerprint
+from loopwright.pipeline.engine.folder import Folder, apply, read_files
+from loopwright.pipeline.engine.origin import commit, told
+from loopwright.pipeline.engine.spoken import BARS
+from loopwright.pipeline.engine.stage_files import StageFiles
 
 FAILED = 2
 
@@ -46,7 +46,7 @@ def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
         future.cancel()
         raise
     except Exception as error:
-        from pipeline.engine.parallel import lost  # with what the pieces need, which a client does not
+        from loopwright.pipeline.engine.parallel import lost  # with what the pieces need, which a client does not
 
         print(f"{' '.join(arguments)}: {lost(error, 'the stage')}", file=sys.stderr)
         return FAILED
@@ -63,11 +63,11 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     """(exit status, changed files, what was said last), pickled; on a worker."""
     from distributed import get_worker
 
-    from pipeline.engine.command import run_stage
-    from pipeline.engine.pieces import Task, doing, mixture, still_wanted
-    from pipeline.engine.preload import unwatched
-    from pipeline.engine.progress import lines_anew
-    from pipeline.engine.spoken import spoken_to
+    from loopwright.pipeline.engine.command import run_stage
+    from loopwright.pipeline.engine.pieces import Task, doing, mixture, still_wanted
+    from loopwright.pipeline.engine.preload import unwatched
+    from loopwright.pipeline.engine.progress import lines_anew
+    from loopwright.pipeline.engine.spoken import spoken_to
 
     worker, files = get_worker(), pickle.loads(read)
     unwatched(worker)
@@ -82,7 +82,7 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
             return pickle.dumps((FAILED, {}, [("stderr", f"{' '.join(arguments)}: {mixture(other)}\n")]))
         with Folder(files, worker.local_directory) as folder, doing(Task(files, lambda: still_wanted(worker, topic))):
             try:
-                stage = getattr(importlib.import_module(f"pipeline.stages.{kind}"), kind)
+                stage = getattr(importlib.import_module(f"loopwright.pipeline.stages.{kind}"), kind)
                 code = run_stage(stage, [kind, *names], "NAME" if names else "")
             except Exception:
                 return pickle.dumps((1, {}, [("stderr", traceback.format_exc())]))

@@ -1,4 +1,4 @@
-"""``python -m pipeline.engine.start KIND [NAME]``: one stage, as dvc.yaml runs it.
+"""``python -m loopwright.pipeline.engine.start KIND [NAME]``: one stage, as dvc.yaml runs it.
 
 A stage that works long runs on the cluster that DASK_SCHEDULER_ADDRESS names, which `loopwright run` starts on this
 machine; without one it starts its own. This process then only reads, waits and writes. Under DVC a stage that
@@ -21,7 +21,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-# Set for the commands under pipeline.engine.with_cluster: the door of a run, which is open as long as the run goes on.
+# Set for the commands under loopwright.pipeline.engine.with_cluster: the door of a run, which is open as long as the
+# run goes on.
 DOOR = "LOOPWRIGHT_RUN"
 # Set for the workers of a cluster of this machine: kinds of stages, with commas, that it is for. Unset: any may come.
 STAGES = "LOOPWRIGHT_STAGES"
@@ -72,7 +73,7 @@ def run_here(arguments: list[str]) -> int | str | None:
     """The stage in this process; what it gives to ``sys.exit``."""
     sys.argv[1:] = arguments[1:]
     try:
-        runpy.run_module(f"pipeline.stages.{arguments[0]}", run_name="__main__", alter_sys=True)
+        runpy.run_module(f"loopwright.pipeline.stages.{arguments[0]}", run_name="__main__", alter_sys=True)
     except SystemExit as end:
         return end.code
     return 0
@@ -80,14 +81,14 @@ def run_here(arguments: list[str]) -> int | str | None:
 
 def run(arguments: list[str]) -> int | str | None:
     """The stage, on a cluster or here; what ``sys.exit`` is to be given."""
-    from pipeline.engine.stage_files import on_cluster
+    from loopwright.pipeline.engine.stage_files import on_cluster
 
     files = on_cluster(arguments[0], arguments[1]) if len(arguments) == 2 else None
     if files is None:
         return run_here(arguments)
-    from pipeline.engine.cluster import address, local_cluster
-    from pipeline.engine.remote import FAILED, run_on
-    from pipeline.errors import PipelineError
+    from loopwright.pipeline.engine.cluster import address, local_cluster
+    from loopwright.pipeline.engine.remote import FAILED, run_on
+    from loopwright.pipeline.errors import PipelineError
 
     try:
         at = address()
@@ -110,7 +111,7 @@ def main() -> None:
     """Run the stage that the command line names."""
     arguments = sys.argv[1:]
     if not arguments or not arguments[0].isidentifier():
-        sys.exit("usage: python -m pipeline.engine.start KIND [NAME]: a stage, as dvc.yaml runs it")
+        sys.exit("usage: python -m loopwright.pipeline.engine.start KIND [NAME]: a stage, as dvc.yaml runs it")
     gc.set_threshold(NEW_OBJECTS)
     end_with_run()
     started, clock = time.time(), time.monotonic()

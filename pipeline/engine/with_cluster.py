@@ -1,4 +1,4 @@
-"""``python -m pipeline.engine.with_cluster COMMAND...``: run a command whose stages share one cluster.
+"""``python -m loopwright.pipeline.engine.with_cluster COMMAND...``: run a command whose stages share one cluster.
 
 The cluster has a worker of one thread a core, which loads its libraries once; or it is the one that
 DASK_SCHEDULER_ADDRESS names. Stages end with this process, whatever ends it: after SIGTERM those that run are ended,
@@ -19,19 +19,19 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from pipeline.engine.cluster import address, local_cluster, usual_workers
-from pipeline.engine.lifeline import end_with_parent
-from pipeline.engine.outlet import outlet
-from pipeline.engine.start import DOOR
-from pipeline.errors import PipelineError
+from loopwright.pipeline.engine.cluster import address, local_cluster, usual_workers
+from loopwright.pipeline.engine.lifeline import end_with_parent
+from loopwright.pipeline.engine.outlet import outlet
+from loopwright.pipeline.engine.start import DOOR
+from loopwright.pipeline.errors import PipelineError
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; its exit status."""
     command = list(argv)
     if not command:
-        usage = "usage: python -m pipeline.engine.with_cluster COMMAND..., such as: "
-        print(usage + "python -m pipeline.engine.with_cluster dvc repro", file=sys.stderr)
+        usage = "usage: python -m loopwright.pipeline.engine.with_cluster COMMAND..., such as: "
+        print(usage + "python -m loopwright.pipeline.engine.with_cluster dvc repro", file=sys.stderr)
         return 2
     try:
         workers = None if address() else usual_workers()

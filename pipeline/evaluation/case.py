@@ -14,18 +14,18 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config.known import Known
-from pipeline.errors import ParamsError, PlantError
-from pipeline.evaluation.closed_loop import closed_loop_metrics
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.grounds import RecordVerdict
-from pipeline.evaluation.metric import METRICS, Metric
-from pipeline.metrics import rmse
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.records.record import Record
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.errors import ParamsError, PlantError
+from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.grounds import RecordVerdict
+from loopwright.pipeline.evaluation.metric import METRICS, Metric
+from loopwright.pipeline.metrics import rmse
+from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
 Setting = Mapping[str, float | str]

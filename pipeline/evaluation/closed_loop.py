@@ -15,8 +15,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.evaluation.metric import METRICS
-from pipeline.metrics import errors, ise, mv_travel
+from loopwright.pipeline.evaluation.metric import METRICS
+from loopwright.pipeline.metrics import errors, ise, mv_travel
 
 Array = NDArray[np.float64]
 

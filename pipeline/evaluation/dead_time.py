@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.plants.simulator import Array, Simulator
-from serving.manifest import Signal
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.serving.manifest import Signal
 
 MOVE = 0.1  # of an MV's range
 SEEN = 1e-6  # of a controlled variable's range: less is rounding

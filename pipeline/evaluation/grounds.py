@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
-from pipeline.files import read_json
-from pipeline.records.old_controller import OldController
-from pipeline.records.operated import Operated
+from loopwright.pipeline.files import read_json
+from loopwright.pipeline.records.old_controller import OldController
+from loopwright.pipeline.records.operated import Operated
 
 SCREENING = "screening.json"
 """Beside the record of an own plant: what `loopwright new` or stage `screen` found of it."""

@@ -14,11 +14,11 @@ from itertools import product
 
 import numpy as np
 
-from pipeline.evaluation.closed_loop import FAR, holds
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.plants.simulator import Array
-from pipeline.simulation.rests import BALANCED, balanced, inside
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.evaluation.closed_loop import FAR, holds
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.rests import BALANCED, balanced, inside
+from loopwright.pipeline.simulation.scenario import Scenario
 
 FINE, COARSE = 9, 3  # constant values of one MV, and of each of several
 TOGETHER = 3  # most MVs of which all combinations are tried

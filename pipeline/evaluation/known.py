@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.evaluation.model_evidence import Metrics, identified_part
-from pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
+from loopwright.pipeline.evaluation.validation import Statement
 
 TIMES = 3.0
 """Answer that a record allows over the model's, up to which the model has the size that it needs."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.typed_json import parsed, read_mapping, to_json
-from pipeline.files import write_text
+from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
+from loopwright.pipeline.files import write_text
 
 Array = NDArray[np.float64]
 Loop = dict[str, Array]

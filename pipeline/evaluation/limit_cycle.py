@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.closed_loop import STEP_BAND, last_half, swings
-from pipeline.evaluation.law_evidence import Cycle
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import Trajectory
-from serving.manifest import Signal
+from loopwright.pipeline.evaluation.case import Array, Case
+from loopwright.pipeline.evaluation.closed_loop import STEP_BAND, last_half, swings
+from loopwright.pipeline.evaluation.law_evidence import Cycle
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import Trajectory
+from loopwright.serving.manifest import Signal
 
 MV_SWING: Final = 0.05  # of an MV's range: a valve that swings farther to the end wears, whatever the CV does
 NOISES: Final = 5.0  # standard deviations of the noise: a smaller swing of a CV is lost in them

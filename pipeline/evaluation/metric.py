@@ -9,8 +9,8 @@ from typing import Literal
 
 from numpy.typing import ArrayLike
 
-from pipeline import metrics
-from pipeline.errors import ParamsError
+from loopwright.pipeline import metrics
+from loopwright.pipeline.errors import ParamsError
 
 Figures = dict[str, float]
 How = Literal["mean", "max", "min", "sum"]

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.metric import together
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import simulate_closed
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.case import Array, Case
+from loopwright.pipeline.evaluation.metric import together
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import simulate_closed
 
 RUNS_AWAY = 1.0
 """Ranges of a controlled variable from its set point, where no plant and no transmitter goes."""

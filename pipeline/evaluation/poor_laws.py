@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.metric import gate_ratio
-from pipeline.evaluation.model_evidence import IDENTIFIED
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.metric import gate_ratio
+from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 CLEARLY: Final = 0.9  # of the error without control: a law that leaves more of it follows no set point
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pipeline.evaluation.known import TIMES, decides, known_of, question
-from pipeline.evaluation.model_evidence import Metrics, identified_part
-from pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.known import TIMES, decides, known_of, question
+from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
+from loopwright.pipeline.evaluation.validation import Statement
 
 MISSED = 0.5  # of a PV's motion beyond the noise: a model that misses more explains the lesser part of it
 SHARE = 0.8  # free-run error over the PV's deviation, noise and all: a model that has more hardly needs its inputs

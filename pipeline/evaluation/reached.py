@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.model_evidence import IDENTIFIED, identified_part
-from pipeline.evaluation.proof import fit_doubts, sign_doubts
-from pipeline.plants.simulator import Array
-from pipeline.simulation.simulate import Trajectory
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED, identified_part
+from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.simulate import Trajectory
 
 Ranges = Mapping[str, tuple[float, float]]
 """Signal -> the lowest and the highest value."""

@@ -8,12 +8,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pipeline.errors import RecordError
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
-from serving.errors import LoopwrightError
-from serving.manifest import Signal
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.manifest import Signal
 
 UNSEEN = 0.2  # share of the rows, the last ones: the choice of the model's structure held them out
 MOST = 2_000  # rows
@@ -21,7 +21,7 @@ AT_END = 1e-3  # of an MV's range
 
 
 class Steps(Protocol):
-    """An object that steps a control law: ``serving.Controller``."""
+    """An object that steps a control law: ``loopwright.serving.Controller``."""
 
     def cold_state(self) -> Array:
         """The state of no past."""

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
-from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.law_evidence import lock_up_text
-from pipeline.evaluation.metric import gate_ratio, ratio_to_bound
-from pipeline.evaluation.validation import FILE, Statement, Validation
-from pipeline.files import read_json
-from pipeline.simulation import NOISE_SUFFIX
+from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.law_evidence import lock_up_text
+from loopwright.pipeline.evaluation.metric import gate_ratio, ratio_to_bound
+from loopwright.pipeline.evaluation.validation import FILE, Statement, Validation
+from loopwright.pipeline.files import read_json
+from loopwright.pipeline.simulation import NOISE_SUFFIX
 
 
 @dataclass(frozen=True, slots=True)

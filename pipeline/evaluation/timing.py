@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.verdicts import Check, Outcome
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.verdicts import Check, Outcome
 
 HOW = "(timed during validation, beside other work; `make bench` times it alone)"
 

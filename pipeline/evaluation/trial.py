@@ -8,18 +8,18 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.closed_loop import left_limits, lock_ups, swings
-from pipeline.evaluation.knowing_control import reached
-from pipeline.evaluation.law_evidence import Cycle
-from pipeline.evaluation.limit_cycle import cycle_of
-from pipeline.evaluation.metric import mean_of_draws
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import DV_DRAW, Trajectory, disturbance_noise, simulate_closed
-from serving.controller import Controller
-from serving.errors import LoopwrightError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.closed_loop import left_limits, lock_ups, swings
+from loopwright.pipeline.evaluation.knowing_control import reached
+from loopwright.pipeline.evaluation.law_evidence import Cycle
+from loopwright.pipeline.evaluation.limit_cycle import cycle_of
+from loopwright.pipeline.evaluation.metric import mean_of_draws
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import DV_DRAW, Trajectory, disturbance_noise, simulate_closed
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopwrightError
 
 Metrics = dict[str, float]
 ROUNDS = 8  # of timing a step

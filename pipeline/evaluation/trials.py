@@ -8,15 +8,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from pipeline.engine.parallel import parallel_map
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.law_evidence import BASE, Cycle
-from pipeline.evaluation.metric import together
-from pipeline.evaluation.reached import reached_by, widest
-from pipeline.evaluation.trial import DEVELOPED, DEVELOPMENT, Metrics, Trial, repeated
-from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
-from pipeline.simulation.simulate import Trajectory
-from serving.controller import Controller
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.law_evidence import BASE, Cycle
+from loopwright.pipeline.evaluation.metric import together
+from loopwright.pipeline.evaluation.reached import reached_by, widest
+from loopwright.pipeline.evaluation.trial import DEVELOPED, DEVELOPMENT, Metrics, Trial, repeated
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from loopwright.pipeline.simulation.simulate import Trajectory
+from loopwright.serving.controller import Controller
 
 Kind = Literal["scored", "development", "shown"]
 

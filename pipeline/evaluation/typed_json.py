@@ -8,8 +8,8 @@ from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pipeline.config.params import parse
-from pipeline.errors import ParamsError, ReportError
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import ParamsError, ReportError
 
 T = TypeVar("T")
 REMEDY = "run `dvc repro`, which writes it again"

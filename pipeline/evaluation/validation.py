@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.law_evidence import Analysis, Row
-from pipeline.evaluation.typed_json import parsed, read_mapping, to_json
+from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.law_evidence import Analysis, Row
+from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 
 SCHEMA = 1
 """It changes with the meaning of an entry; a new entry with a default does not change it."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pipeline.evaluation.case import PaperFigure
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.case import PaperFigure
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.validation import Statement
 
 RELATIVE = 0.25
 ABSOLUTE = 1e-4

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pipeline.excitation.base import Excitation, OpenLoop
-from pipeline.excitation.batches import Batches
-from pipeline.excitation.operating_point import OperatingPoint
-from pipeline.excitation.sequences import Aprbs, Multisine, Prbs, RandomSteps
+from loopwright.pipeline.excitation.base import Excitation, OpenLoop
+from loopwright.pipeline.excitation.batches import Batches
+from loopwright.pipeline.excitation.operating_point import OperatingPoint
+from loopwright.pipeline.excitation.sequences import Aprbs, Multisine, Prbs, RandomSteps
 
 EXCITATIONS: dict[str, type[Excitation]] = {
     RandomSteps.kind: RandomSteps,

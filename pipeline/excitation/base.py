@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ParamsError
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
-from pipeline.simulation.simulate import noise_draws, simulate_open
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.simulate import noise_draws, simulate_open
 
 
 def within(default: Any, least: float, most: float = np.inf) -> Any:

@@ -7,12 +7,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.errors import ParamsError
-from pipeline.excitation.base import OpenLoop, within
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
-from pipeline.simulation.simulate import simulate_batch
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.excitation.base import OpenLoop, within
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.simulate import simulate_batch
 
 
 @dataclass(frozen=True, kw_only=True)

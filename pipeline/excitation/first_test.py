@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.simulator import Array, Simulator
 
 STEP = 0.05  # of an MV's range
 SHORT, LONGEST = 200, 6_400  # periods of a run: doubled until it settles

@@ -8,13 +8,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.excitation.base import Excitation, within
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
-from pipeline.simulation.simulate import noise_draws, simulate_batch
-from pipeline.tuning.rules import AllPole, PidSettings, imc_pid, robust_imc
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.excitation.base import Excitation, within
+from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.simulate import noise_draws, simulate_batch
+from loopwright.pipeline.tuning.rules import AllPole, PidSettings, imc_pid, robust_imc
 
 
 @dataclass(frozen=True, slots=True, eq=False)

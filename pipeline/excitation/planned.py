@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.excitation.first_test import FirstTest
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
-from pipeline.simulation.simulate import noise_draws
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.excitation.first_test import FirstTest
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.simulate import noise_draws
 
 SHORTEST, LONGEST_HOLD = 0.1, 1.5  # of the settling time
 FEWEST_HOLDS = 60  # of each MV in the record; the holds are shorter where it would have fewer

@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ParamsError
-from pipeline.excitation.base import OpenLoop, within
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.excitation.base import OpenLoop, within
+from loopwright.pipeline.plants.simulator import Array
 
 TAPS: dict[int, tuple[int, ...]] = {
     2: (2, 1),

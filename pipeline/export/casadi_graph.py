@@ -10,8 +10,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from pipeline.errors import ExportError
-from serving.graph_audit import MAX_IR
+from loopwright.pipeline.errors import ExportError
+from loopwright.serving.graph_audit import MAX_IR
 
 OPSET = 18
 RUNS = "n"  # the first dimension of every input and output: runs side by side

@@ -1,6 +1,6 @@
 """A controller's file: graph, manifest and digest written together; its evidence may be changed later.
 
-Apart from ``pipeline.export.gate``, because whoever only runs controllers needs no torch, and importing
+Apart from ``loopwright.pipeline.export.gate``, because whoever only runs controllers needs no torch, and importing
 that takes longer than many a closed loop.
 """
 
@@ -14,11 +14,11 @@ from typing import Any
 
 import onnx
 
-from pipeline.files import draft_of, write_text
-from serving.controller import Controller
-from serving.digest import TRAILER_BYTES, file_digest, seal
-from serving.manifest import MANIFEST_KEY, Manifest
-from serving.sidecar import sidecar
+from loopwright.pipeline.files import draft_of, write_text
+from loopwright.serving.controller import Controller
+from loopwright.serving.digest import TRAILER_BYTES, file_digest, seal
+from loopwright.serving.manifest import MANIFEST_KEY, Manifest
+from loopwright.serving.sidecar import sidecar
 
 
 def with_evidence(src: str | Path, dst: str | Path, evidence: Mapping[str, Any]) -> Manifest:

@@ -10,18 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from pipeline.engine import progress
-from pipeline.errors import ExportError
-from pipeline.export.controller_file import assembled, write_sidecar
-from pipeline.export.fusion import fused
-from pipeline.export.graph import example_inputs, law_graph
-from pipeline.export.operators import check_operators
-from pipeline.files import draft_of
-from pipeline.laws.base import ControlLaw
-from pipeline.plants.simulator import Array
-from serving.controller import Controller
-from serving.errors import LoopwrightError
-from serving.manifest import INPUTS, SENSITIVE, Manifest, Signal
+from loopwright.pipeline.engine import progress
+from loopwright.pipeline.errors import ExportError
+from loopwright.pipeline.export.controller_file import assembled, write_sidecar
+from loopwright.pipeline.export.fusion import fused
+from loopwright.pipeline.export.graph import example_inputs, law_graph
+from loopwright.pipeline.export.operators import check_operators
+from loopwright.pipeline.files import draft_of
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.manifest import INPUTS, SENSITIVE, Manifest, Signal
 
 GATE_STEPS = 1_000
 GATE_TOLERANCE = 1e-9
@@ -43,7 +43,7 @@ def export(
 ) -> Manifest:
     """Write ``law`` as one ONNX graph with its manifest, and the manifest again as .json beside it.
 
-    The graph is fused, see ``pipeline.export.fusion``, and written to a draft. The draft is loaded by the
+    The graph is fused, see ``loopwright.pipeline.export.fusion``, and written to a draft. The draft is loaded by the
     runtime that will serve it, and renamed only after each of 1,000 steps of a closed loop agrees with the torch
     module, see ``parity_gate``. Where the loop amplifies rounding, the manifest's provenance says after how many steps
     two machines part, ``sensitive_after_steps``.

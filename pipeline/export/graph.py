@@ -13,12 +13,12 @@ import torch
 from onnx_ir.passes import common as passes
 from onnxscript import optimizer
 
-from pipeline.errors import ExportError
-from pipeline.export.operators import check_operators
-from pipeline.export.torch_exporter import nothing_twice, quiet
-from pipeline.laws.base import ControlLaw
-from serving.graph_audit import MAX_IR
-from serving.manifest import INPUTS
+from loopwright.pipeline.errors import ExportError
+from loopwright.pipeline.export.operators import check_operators
+from loopwright.pipeline.export.torch_exporter import nothing_twice, quiet
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.serving.graph_audit import MAX_IR
+from loopwright.serving.manifest import INPUTS
 
 OPSET = 18  # the exporter's own: no version conversion, and older runtimes read it
 OUTPUTS = ("mv", "state_next", "info")

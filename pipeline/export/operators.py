@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import onnx
 
-from pipeline.errors import ExportError
-from pipeline.laws.base import ControlLaw
-from serving.errors import ArtifactError
-from serving.graph_audit import audit
+from loopwright.pipeline.errors import ExportError
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.serving.errors import ArtifactError
+from loopwright.serving.graph_audit import audit
 
 # Behind these a value is no longer a transposed matrix.
 RESHAPING = frozenset({"Flatten", "Gather", "Gemm", "MatMul", "Reshape", "Squeeze"})

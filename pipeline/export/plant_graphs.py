@@ -11,10 +11,10 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
-from pipeline.errors import ExportError
-from pipeline.export.casadi_graph import OPSET, casadi_graph
-from pipeline.plants.equations import EquationPlant, rk4_step
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ExportError
+from loopwright.pipeline.export.casadi_graph import OPSET, casadi_graph
+from loopwright.pipeline.plants.equations import EquationPlant, rk4_step
+from loopwright.pipeline.plants.simulator import Array
 
 UNROLLED = 1_500  # operations above which the substeps are a loop: a runtime takes seconds to load thousands of nodes
 TOLERANCE = 1e-9

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.config.exports import ExportParams
-from pipeline.config.plants import MvParams, PlantParams, SignalParams
-from pipeline.errors import ParamsError
-from pipeline.historian.tags import COMMANDS, SIGNAL_ROLES, Tag
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.config.exports import ExportParams
+from loopwright.pipeline.config.plants import MvParams, PlantParams, SignalParams
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.historian.tags import COMMANDS, SIGNAL_ROLES, Tag
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 Stated = SignalParams | MvParams
 

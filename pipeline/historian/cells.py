@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.character import runs_of
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.character import runs_of
+from loopwright.pipeline.metrics import Array
 
 Where = NDArray[np.bool_]
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.metrics import Array
+from loopwright.pipeline.metrics import Array
 
 SAMPLE = 50_000
 STUCK_CHANCE = 1e-4  # of a stretch as long by chance anywhere in the record

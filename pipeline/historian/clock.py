@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.metrics import Array
+from loopwright.pipeline.metrics import Array
 
 GAP = 20.0  # steps, from which a window of stamps says nothing of the step
 FIRST, WIDER = 16, 4  # stamps of the first windows, and by how much each next ones are longer

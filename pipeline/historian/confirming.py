@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding, counted
-from pipeline.historian.grid import Grid
-from pipeline.historian.linear import Linear, fitted
-from pipeline.historian.reason import Reason
-from pipeline.historian.sampling import Sampling
-from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.findings import Finding, counted
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.linear import Linear, fitted
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.sampling import Sampling
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.metrics import Array
 
 CONFIRM_SD = 5.0  # residual of the model below which an outlier is an answer
 ERROR_SD = 8.0  # size of a measurement's error, in standard deviations of its estimate

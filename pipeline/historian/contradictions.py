@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.character import runs_of
-from pipeline.historian.findings import Finding, counted
-from pipeline.historian.grid import Grid
-from pipeline.historian.reason import Reason
-from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.character import runs_of
+from loopwright.pipeline.historian.findings import Finding, counted
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.metrics import Array
 
 SHORTEST, LONGEST, SETTLINGS = 60, 400, 2.0  # rows of a window, in rows and in settling times
 STEPS = 4  # a window begins at every quarter of one

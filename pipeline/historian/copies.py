@@ -8,13 +8,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.character import noisy
-from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding, counted
-from pipeline.historian.reason import Reason
-from pipeline.historian.sent_again import row_keys, with_the_same_stamps
-from pipeline.historian.tags import SIGNAL_ROLES, Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.character import noisy
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.findings import Finding, counted
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.sent_again import row_keys, with_the_same_stamps
+from loopwright.pipeline.historian.tags import SIGNAL_ROLES, Tag
+from loopwright.pipeline.metrics import Array
 
 FOLDS = (2, 2, 2, 3)
 WINDOW = math.prod(FOLDS)  # rows that must repeat

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 
-from pipeline.errors import RecordError
+from loopwright.pipeline.errors import RecordError
 
 DATE = re.compile(r"^(?P<a>\d{1,4})(?P<sign>[./\- ])(?P<b>\d{1,2})(?P=sign)(?P<c>\d{4}|\d{1,2})(?P<rest>(?:\D.*)?)$")
 COMPACT = re.compile(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.errors import RecordError
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.metrics import Array
 
 DAY_S = 86_400.0
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.errors import RecordError
-from pipeline.historian.numbers import NUMBER, THOUSANDS, plain
-from pipeline.historian.table_head import kind_of_cell
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.numbers import NUMBER, THOUSANDS, plain
+from loopwright.pipeline.historian.table_head import kind_of_cell
 
 COMMA_DECIMAL = re.compile(r"^\s*[+-]?(\d{1,3}(\.\d{3})+|\d*),\d+([eE][+-]?\d+)?\s*$")
 POINT_DECIMAL = re.compile(r"^\s*[+-]?\d*\.\d+([eE][+-]?\d+)?\s*$")

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import RecordError
-from pipeline.historian.decimal_sign import Sign, decimal_sign
-from pipeline.historian.file_kinds import head_of, kind_of
-from pipeline.historian.headers import split_header
-from pipeline.historian.quality import is_quality_name
-from pipeline.historian.table_head import Head, head_of_table
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.decimal_sign import Sign, decimal_sign
+from loopwright.pipeline.historian.file_kinds import head_of, kind_of
+from loopwright.pipeline.historian.headers import split_header
+from loopwright.pipeline.historian.quality import is_quality_name
+from loopwright.pipeline.historian.table_head import Head, head_of_table
 
 SAMPLE_BYTES = 1 << 18
 SAMPLE_LINES = 200

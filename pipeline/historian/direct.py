@@ -16,8 +16,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.linear import Blocks, blocks_of
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.linear import Blocks, blocks_of
+from loopwright.pipeline.metrics import Array
 
 FINE = 6  # lags with a coefficient of their own; later ones share one
 WIDER = 1.5  # a block over the one before

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.historian.export import Series
-from pipeline.records.record import Record
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.records.record import Record
 
 SEEN, WINDOW = 200_000, 20_000  # rows
 STRETCHES = 4  # of the readings of a long export

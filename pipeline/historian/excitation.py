@@ -9,15 +9,15 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.feedback import follows
-from pipeline.historian.findings import InputReport, Verdict, counted
-from pipeline.historian.first_answer import first_answer
-from pipeline.historian.linear import Linear
-from pipeline.historian.settled import certain
-from pipeline.historian.spectra import Spectrum, spectra
-from pipeline.metrics import Array
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.historian.feedback import follows
+from loopwright.pipeline.historian.findings import InputReport, Verdict, counted
+from loopwright.pipeline.historian.first_answer import first_answer
+from loopwright.pipeline.historian.linear import Linear
+from loopwright.pipeline.historian.settled import certain
+from loopwright.pipeline.historian.spectra import Spectrum, spectra
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 Runs = NDArray[np.int64]
 

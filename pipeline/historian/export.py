@@ -12,10 +12,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.character import runs_of
-from pipeline.historian.numbers import Codes
-from pipeline.historian.reason import Reason
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.character import runs_of
+from loopwright.pipeline.historian.numbers import Codes
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.metrics import Array
 
 MOST_PASSES = 20  # over the same time; more is disorder
 LEAST_OVERLAP = 5  # readings

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.config.exports import ExportedTag, ExportParams
-from pipeline.historian.guessing import controlled_first, loop_of
-from pipeline.historian.reading import read_export, units_of
-from pipeline.historian.screening import Screened, screened
-from pipeline.historian.tags import Tag, named, safe_name
+from loopwright.pipeline.config.exports import ExportedTag, ExportParams
+from loopwright.pipeline.historian.guessing import controlled_first, loop_of
+from loopwright.pipeline.historian.reading import read_export, units_of
+from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.tags import Tag, named, safe_name
 
 
 def exported(tag: Tag) -> ExportedTag:

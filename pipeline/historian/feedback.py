@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.direct import DirectModel
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.direct import DirectModel
+from loopwright.pipeline.metrics import Array
 
 Runs = NDArray[np.int64]
 

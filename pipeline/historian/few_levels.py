@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.historian.findings import Verdict
-from pipeline.historian.missing_codes import PERCENT
-from pipeline.historian.tags import Tag
-from pipeline.records.levels import levels_of, only_between
-from pipeline.records.record import Record
+from loopwright.pipeline.historian.findings import Verdict
+from loopwright.pipeline.historian.missing_codes import PERCENT
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.records.levels import levels_of, only_between
+from loopwright.pipeline.records.record import Record
 
 END = 0.01  # of the range: so near is an end
 SWITCHED = ((0.0, 1.0), (0.0, 100.0))  # what an on-off valve is often written as, whatever its range

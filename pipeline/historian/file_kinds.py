@@ -7,7 +7,7 @@ import zipfile
 import zlib
 from pathlib import Path
 
-from pipeline.errors import RecordError
+from loopwright.pipeline.errors import RecordError
 
 GZIP, PARQUET, ZIP = b"\x1f\x8b", b"PAR1", b"PK\x03\x04"
 # First bytes -> what the file is, and what to do with it.

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from pipeline.historian.sampling import Sampling
-from pipeline.records.old_controller import OldController
-from pipeline.records.operated import Operated
+from loopwright.pipeline.historian.sampling import Sampling
+from loopwright.pipeline.records.old_controller import OldController
+from loopwright.pipeline.records.operated import Operated
 
 
 def counted(n: int, one: str, more: str = "") -> str:

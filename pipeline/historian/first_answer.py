@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_toeplitz, solve_triangular, toeplitz
 
-from pipeline.metrics import Array
+from loopwright.pipeline.metrics import Array
 
 FOLLOWED = 80  # rows after a move, whose sum has the sign of the answer
 LONGEST, LEAD = 320, 20  # rows after a move, and before it: then the export stores it late

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.linear import Linear, answer_of, fitted
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.linear import Linear, answer_of, fitted
+from loopwright.pipeline.metrics import Array
 
 WINDOW, WINDOWS = 400, 8  # rows of a free run that is compared, and how many there are at least
 KNOTS = (32, 8)  # of lines in time that take up a drift

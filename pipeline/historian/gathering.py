@@ -10,11 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.errors import RecordError
-from pipeline.historian.export import Series
-from pipeline.historian.numbers import numbers
-from pipeline.historian.quality import MOST_QUALITIES, meaning_of
-from pipeline.historian.reason import Reason
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.numbers import numbers
+from loopwright.pipeline.historian.quality import MOST_QUALITIES, meaning_of
+from loopwright.pipeline.historian.reason import Reason
 
 GROWTH = 1.1  # of an array that is full: what is spare takes memory too
 

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordError
-from pipeline.historian.clock import exact_step, row_numbers, whole_multiple
-from pipeline.historian.export import Series
-from pipeline.historian.numbers import Codes
-from pipeline.historian.reason import Reason
-from pipeline.historian.sampling import Sampling, sampling
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.clock import exact_step, row_numbers, whole_multiple
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.numbers import Codes
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.sampling import Sampling, sampling
+from loopwright.pipeline.metrics import Array
 
 MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20
 THINNED = 1.9  # readings a period from which PVs are averaged

@@ -10,19 +10,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.cells import slips_of, usual
-from pipeline.historian.character import smallest_difference
-from pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, moves_of
-from pipeline.historian.export import Export, Series
-from pipeline.historian.feedback import follows
-from pipeline.historian.first_answer import first_answer
-from pipeline.historian.grid import resampled
-from pipeline.historian.linear import fitted
-from pipeline.historian.missing_codes import sentinels
-from pipeline.historian.reason import Reason
-from pipeline.historian.sampling import proposed_period
-from pipeline.historian.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag, automatic, by_hand
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.cells import slips_of, usual
+from loopwright.pipeline.historian.character import smallest_difference
+from loopwright.pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, moves_of
+from loopwright.pipeline.historian.export import Export, Series
+from loopwright.pipeline.historian.feedback import follows
+from loopwright.pipeline.historian.first_answer import first_answer
+from loopwright.pipeline.historian.grid import resampled
+from loopwright.pipeline.historian.linear import fitted
+from loopwright.pipeline.historian.missing_codes import sentinels
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.sampling import proposed_period
+from loopwright.pipeline.historian.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag, automatic, by_hand
+from loopwright.pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (
     (r"(mode|modus|betriebsart|md|auto)$", "mode"),

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.config.known import NONE, NOTHING, SURE, Known
-from pipeline.historian.direct import DirectModel
-from pipeline.records.record import Record
+from loopwright.pipeline.config.known import NONE, NOTHING, SURE, Known
+from loopwright.pipeline.historian.direct import DirectModel
+from loopwright.pipeline.records.record import Record
 
 WINDOWS = ((20, 30), (40, 60), (60, 90))
 """Rows after a step over which an answer is taken; the last ones come nearest to the gain."""

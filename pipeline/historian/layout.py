@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import RecordError
-from pipeline.historian.export import Note
-from pipeline.historian.headers import split_header, tags_of
-from pipeline.historian.quality import QUALITY, is_quality, is_sure, names_a_state
-from pipeline.historian.table_head import UNIT_WORDS, kind_of_cell
-from pipeline.historian.time_column import TimeColumn, seconds_of, time_column_of
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.export import Note
+from loopwright.pipeline.historian.headers import split_header, tags_of
+from loopwright.pipeline.historian.quality import QUALITY, is_quality, is_sure, names_a_state
+from loopwright.pipeline.historian.table_head import UNIT_WORDS, kind_of_cell
+from loopwright.pipeline.historian.time_column import TimeColumn, seconds_of, time_column_of
+from loopwright.pipeline.metrics import Array
 
 TAG_NAMES = {
     "tag", "tagname", "tagid", "name", "point", "pointname", "pointid", "signal", "signalname", "variable", "varname",

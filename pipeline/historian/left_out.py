@@ -8,13 +8,13 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config.intervals import Interval
-from pipeline.errors import RecordError
-from pipeline.historian.export import Export, Series
-from pipeline.historian.findings import Finding, counted
-from pipeline.historian.grid import Grid
-from pipeline.historian.reason import Reason
-from pipeline.historian.times import SINCE_1970_S, UNSTATED
+from loopwright.pipeline.config.intervals import Interval
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.export import Export, Series
+from loopwright.pipeline.historian.findings import Finding, counted
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.times import SINCE_1970_S, UNSTATED
 
 Span = tuple[float, float]  # [s] as the export counts, from the first to before the second
 

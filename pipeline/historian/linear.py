@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.metrics import Array
+from loopwright.pipeline.metrics import Array
 
 Blocks = tuple[tuple[int, int], ...]
 

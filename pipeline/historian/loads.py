@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.excitation import SEEN
-from pipeline.historian.findings import InputReport, Verdict
-from pipeline.historian.free_run import free_run
-from pipeline.historian.linear import Linear
-from pipeline.historian.step_test import length_of_test, usual_hold
-from pipeline.metrics import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.historian.excitation import SEEN
+from loopwright.pipeline.historian.findings import InputReport, Verdict
+from loopwright.pipeline.historian.free_run import free_run
+from loopwright.pipeline.historian.linear import Linear
+from loopwright.pipeline.historian.step_test import length_of_test, usual_hold
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.records.record import Record
 
 OVER_LOADS = 3.0  # standard deviations of the loads within a step test, that the answer to a move has
 LEAST_WINDOWS = 3  # of the test's length in the record; else shorter ones

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.grid import Grid
-from pipeline.historian.guessing import loop_in
-from pipeline.historian.tags import Tag, automatic, by_hand
-from pipeline.metrics import Array
-from pipeline.records.set_points import SetPoints
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.guessing import loop_in
+from loopwright.pipeline.historian.tags import Tag, automatic, by_hand
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.records.set_points import SetPoints
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.historian.excerpt import evenly
-from pipeline.historian.excitation import judged
-from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding, Screening, TagReport
-from pipeline.historian.grid import Grid
-from pipeline.historian.sampling import Sampling
-from pipeline.historian.screening import Screened, models_of
-from pipeline.records.record import Record
+from loopwright.pipeline.historian.excerpt import evenly
+from loopwright.pipeline.historian.excitation import judged
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.findings import Finding, Screening, TagReport
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.sampling import Sampling
+from loopwright.pipeline.historian.screening import Screened, models_of
+from loopwright.pipeline.records.record import Record
 
 
 def judged_record(

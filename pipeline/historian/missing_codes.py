@@ -7,10 +7,10 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.cells import core
-from pipeline.historian.character import runs_of
-from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.cells import core
+from loopwright.pipeline.historian.character import runs_of
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.metrics import Array
 
 Where = NDArray[np.bool_]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from pipeline.errors import RecordError, nearest
-from pipeline.historian.export import Series
-from pipeline.historian.tags import Tag
+from loopwright.pipeline.errors import RecordError, nearest
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.tags import Tag
 
 
 def check_modes(without: Sequence[str], tags: Sequence[Tag], own: Mapping[str, Series]) -> None:

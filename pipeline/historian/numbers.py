@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from pipeline.historian.headers import UNIT
-from pipeline.historian.reason import Reason
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.headers import UNIT
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.metrics import Array
 
 EMPTY = ("", "nan", "null", "none", "na", "n/a", "#n/a", "#nv", "-", "--", "?", "<null>", "1.#qnan", "-1.#ind")
 # What a number looks like: with a point; with a point or a comma and no thousands; with whatever signs.

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.grid import Grid
-from pipeline.historian.loop_rows import LoopRows, loops
-from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
-from pipeline.records.old_controller import OldController
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.loop_rows import LoopRows, loops
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.records.old_controller import OldController
 
 WINDOWS = (600, 200, 60, 20)  # rows
 LEAST_WINDOWS = 12  # of a length, or too few are left to fit, to choose and to score

@@ -13,15 +13,15 @@ import pyarrow.compute as pc
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
-from pipeline.errors import RecordError
-from pipeline.historian.decimal_sign import Sign, decimal_sign, whole_files_sign
-from pipeline.historian.dialect import Dialect, is_utf8, sniff
-from pipeline.historian.export import Note
-from pipeline.historian.file_kinds import kind_of
-from pipeline.historian.headers import split_header
-from pipeline.historian.layout import Layout, layout_of
-from pipeline.historian.quality import MOST_QUALITIES
-from pipeline.historian.workbook import sheet_of, text_of
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.decimal_sign import Sign, decimal_sign, whole_files_sign
+from loopwright.pipeline.historian.dialect import Dialect, is_utf8, sniff
+from loopwright.pipeline.historian.export import Note
+from loopwright.pipeline.historian.file_kinds import kind_of
+from loopwright.pipeline.historian.headers import split_header
+from loopwright.pipeline.historian.layout import Layout, layout_of
+from loopwright.pipeline.historian.quality import MOST_QUALITIES
+from loopwright.pipeline.historian.workbook import sheet_of, text_of
 
 BLOCK_BYTES = 1 << 24
 BLOCK_ROWS = 1 << 17

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.grid import Grid
-from pipeline.historian.loop_rows import loops
-from pipeline.historian.tags import Tag
-from pipeline.records.operated import Operated, operation
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.loop_rows import loops
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.records.operated import Operated, operation
 
 
 def operated(

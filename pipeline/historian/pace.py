@@ -8,18 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordError
-from pipeline.historian.excerpt import readings_of
-from pipeline.historian.export import Series
-from pipeline.historian.feedback import fed_back
-from pipeline.historian.findings import Finding
-from pipeline.historian.grid import resampled
-from pipeline.historian.linear import Linear, fitted
-from pipeline.historian.rows import stretches
-from pipeline.historian.sampling import NICE_S
-from pipeline.historian.settled import certain, grows
-from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.excerpt import readings_of
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.feedback import fed_back
+from loopwright.pipeline.historian.findings import Finding
+from loopwright.pipeline.historian.grid import resampled
+from loopwright.pipeline.historian.linear import Linear, fitted
+from loopwright.pipeline.historian.rows import stretches
+from loopwright.pipeline.historian.sampling import NICE_S
+from loopwright.pipeline.historian.settled import certain, grows
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.metrics import Array
 
 MOST_PERIODS, WANTED, LEAST_PERIODS = 60, 40, 28  # in which a plant settles: the longest look ahead, and what is usual
 FINE = 240  # periods up to which an export keeps its step, where its rows as they are show the settling

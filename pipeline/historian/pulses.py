@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding
-from pipeline.historian.grid import Grid
-from pipeline.historian.linear import Linear, fitted
-from pipeline.historian.reason import Reason
-from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.findings import Finding
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.linear import Linear, fitted
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.metrics import Array
 
 FEWEST, MOST_SHARE = 3, 0.03  # pulses, and share of the rows
 SIZE = 0.05  # of the MV's span

@@ -14,17 +14,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.errors import RecordError, nearest
-from pipeline.files import sha256
-from pipeline.historian.day_counts import DAY_S
-from pipeline.historian.export import Contents, Export, Note, Series, joined
-from pipeline.historian.gathering import Gathered
-from pipeline.historian.headers import tag_named, tags_of
-from pipeline.historian.layout import Layout, clocks_apart
-from pipeline.historian.opened import EncodingError, Opened, opened
-from pipeline.historian.sent_again import drop_repeated_rows
-from pipeline.historian.times import UNSTATED, UTC, zone_of
-from pipeline.historian.zones import LocalClock, zone_named
+from loopwright.pipeline.errors import RecordError, nearest
+from loopwright.pipeline.files import sha256
+from loopwright.pipeline.historian.day_counts import DAY_S
+from loopwright.pipeline.historian.export import Contents, Export, Note, Series, joined
+from loopwright.pipeline.historian.gathering import Gathered
+from loopwright.pipeline.historian.headers import tag_named, tags_of
+from loopwright.pipeline.historian.layout import Layout, clocks_apart
+from loopwright.pipeline.historian.opened import EncodingError, Opened, opened
+from loopwright.pipeline.historian.sent_again import drop_repeated_rows
+from loopwright.pipeline.historian.times import UNSTATED, UTC, zone_of
+from loopwright.pipeline.historian.zones import LocalClock, zone_named
 
 
 def read_export(

@@ -9,16 +9,16 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordError
-from pipeline.historian.cells import outliers, slips_of, usual
-from pipeline.historian.decimal_sign import COMMA_DECIMAL, POINT_DECIMAL
-from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding, Verdict, counted
-from pipeline.historian.missing_codes import sentinels
-from pipeline.historian.numbers import loose_number
-from pipeline.historian.reason import Reason
-from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.cells import outliers, slips_of, usual
+from loopwright.pipeline.historian.decimal_sign import COMMA_DECIMAL, POINT_DECIMAL
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.findings import Finding, Verdict, counted
+from loopwright.pipeline.historian.missing_codes import sentinels
+from loopwright.pipeline.historian.numbers import loose_number
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.metrics import Array
 
 RANGE_SLACK = 0.1  # of a PV's given range: noise at its ends
 ONE_SIDED = "one_sided"  # kind of a finding

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.historian.few_levels import on_off
-from pipeline.historian.screening import Screened
-from pipeline.historian.tags import Tag, commanded_range
-from pipeline.metrics import Array
-from serving.manifest import Signal
+from loopwright.pipeline.historian.few_levels import on_off
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.tags import Tag, commanded_range
+from loopwright.pipeline.metrics import Array
+from loopwright.serving.manifest import Signal
 
 LEAST_SHARED = 0.05  # of the commanded or the visited range, the smaller one: what both must share
 

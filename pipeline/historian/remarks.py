@@ -6,19 +6,19 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.historian.cells import noise_sd, usual
-from pipeline.historian.character import quantum, staircase, straight_share
-from pipeline.historian.clock import whole_multiple
-from pipeline.historian.excitation import HELD
-from pipeline.historian.export import Export, Series
-from pipeline.historian.findings import Finding, counted
-from pipeline.historian.first_answer import first_answer
-from pipeline.historian.grid import Grid
-from pipeline.historian.linear import Linear, lead
-from pipeline.historian.sampling import Sampling, sampling
-from pipeline.historian.tags import SIGNAL_ROLES, Tag
-from pipeline.metrics import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.historian.cells import noise_sd, usual
+from loopwright.pipeline.historian.character import quantum, staircase, straight_share
+from loopwright.pipeline.historian.clock import whole_multiple
+from loopwright.pipeline.historian.excitation import HELD
+from loopwright.pipeline.historian.export import Export, Series
+from loopwright.pipeline.historian.findings import Finding, counted
+from loopwright.pipeline.historian.first_answer import first_answer
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.linear import Linear, lead
+from loopwright.pipeline.historian.sampling import Sampling, sampling
+from loopwright.pipeline.historian.tags import SIGNAL_ROLES, Tag
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.records.record import Record
 
 COARSE = 0.002  # of the usual span: a converter's step that a model feels
 STRAIGHT = 0.3  # share of rows in straight lines, from which a signal was compressed

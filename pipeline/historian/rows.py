@@ -9,19 +9,19 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordError
-from pipeline.historian.cells import usual
-from pipeline.historian.character import clipped, runs_of, stuck
-from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding, counted
-from pipeline.historian.grid import Grid
-from pipeline.historian.missing_codes import PERCENT
-from pipeline.historian.reason import Reason
-from pipeline.historian.sampling import Sampling
-from pipeline.historian.tags import GUESSED_PAD, KEEP, Tag
-from pipeline.metrics import Array
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.cells import usual
+from loopwright.pipeline.historian.character import clipped, runs_of, stuck
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.findings import Finding, counted
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.missing_codes import PERCENT
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.sampling import Sampling
+from loopwright.pipeline.historian.tags import GUESSED_PAD, KEEP, Tag
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 OVERFLOWS = f"where the plant ends there, as a tank that overflows, {KEEP}"
 SHORTEST_RUN = 20  # rows

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.errors import RecordError
-from pipeline.historian.character import quantum, staircase
-from pipeline.historian.clock import exact_step, keeps_time
-from pipeline.historian.export import Series
-from pipeline.historian.reason import Reason
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.character import quantum, staircase
+from loopwright.pipeline.historian.clock import exact_step, keeps_time
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.metrics import Array
 
 NICE_S = (
     *(0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.5, 1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30),

@@ -10,39 +10,39 @@ from datetime import tzinfo
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordError
-from pipeline.historian.cells import usual
-from pipeline.historian.character import quantum
-from pipeline.historian.confirming import confirm
-from pipeline.historian.contradictions import contradict
-from pipeline.historian.copies import drop_copies
-from pipeline.historian.excerpt import SEEN, evenly
-from pipeline.historian.excitation import judged, moves_of, with_rows_out_of_range
-from pipeline.historian.export import Export, Series
-from pipeline.historian.few_levels import with_levels
-from pipeline.historian.findings import Finding, Screening, TagReport
-from pipeline.historian.free_run import believed
-from pipeline.historian.grid import Grid, resampled
-from pipeline.historian.left_out import flag_readings, flag_rows, interval_text, of_left_out, spans_of
-from pipeline.historian.linear import Linear
-from pipeline.historian.loads import with_load_moves
-from pipeline.historian.modes import check_modes
-from pipeline.historian.old_controller import old_controllers
-from pipeline.historian.operated import operated
-from pipeline.historian.pace import of_period, pace_of
-from pipeline.historian.pulses import pulses
-from pipeline.historian.readings import clean, reasons_of, with_texts_of_one_side
-from pipeline.historian.reason import Reason
-from pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_notes, of_rows, of_series
-from pipeline.historian.rows import record_of, row_codes, stretches
-from pipeline.historian.sampling import Sampling, proposed_period, sampling
-from pipeline.historian.standstill import stops
-from pipeline.historian.static import explained
-from pipeline.historian.stopped import of_zeros
-from pipeline.historian.tags import Tag
-from pipeline.historian.unmoved import of_answers
-from pipeline.historian.wandering import of_levels, of_quick_models
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.cells import usual
+from loopwright.pipeline.historian.character import quantum
+from loopwright.pipeline.historian.confirming import confirm
+from loopwright.pipeline.historian.contradictions import contradict
+from loopwright.pipeline.historian.copies import drop_copies
+from loopwright.pipeline.historian.excerpt import SEEN, evenly
+from loopwright.pipeline.historian.excitation import judged, moves_of, with_rows_out_of_range
+from loopwright.pipeline.historian.export import Export, Series
+from loopwright.pipeline.historian.few_levels import with_levels
+from loopwright.pipeline.historian.findings import Finding, Screening, TagReport
+from loopwright.pipeline.historian.free_run import believed
+from loopwright.pipeline.historian.grid import Grid, resampled
+from loopwright.pipeline.historian.left_out import flag_readings, flag_rows, interval_text, of_left_out, spans_of
+from loopwright.pipeline.historian.linear import Linear
+from loopwright.pipeline.historian.loads import with_load_moves
+from loopwright.pipeline.historian.modes import check_modes
+from loopwright.pipeline.historian.old_controller import old_controllers
+from loopwright.pipeline.historian.operated import operated
+from loopwright.pipeline.historian.pace import of_period, pace_of
+from loopwright.pipeline.historian.pulses import pulses
+from loopwright.pipeline.historian.readings import clean, reasons_of, with_texts_of_one_side
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_notes, of_rows, of_series
+from loopwright.pipeline.historian.rows import record_of, row_codes, stretches
+from loopwright.pipeline.historian.sampling import Sampling, proposed_period, sampling
+from loopwright.pipeline.historian.standstill import stops
+from loopwright.pipeline.historian.static import explained
+from loopwright.pipeline.historian.stopped import of_zeros
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.unmoved import of_answers
+from loopwright.pipeline.historian.wandering import of_levels, of_quick_models
+from loopwright.pipeline.records.record import Record
 
 LARGE = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.export import SENT_AGAIN, Series
-from pipeline.historian.reason import Reason
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.export import SENT_AGAIN, Series
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.metrics import Array
 
 FACTOR = np.uint64(0x9E3779B97F4A7C15)
 

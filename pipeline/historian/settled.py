@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.first_answer import COLOUR, whitening
-from pipeline.historian.linear import blocks_of, least_squares
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.first_answer import COLOUR, whitening
+from loopwright.pipeline.historian.linear import blocks_of, least_squares
+from loopwright.pipeline.metrics import Array
 
 WIDER = 1.25  # by which a block of lags is longer than the one before
 FOLLOWED = 2.0  # settling times, over which the answer is followed

@@ -9,7 +9,7 @@ from itertools import combinations_with_replacement, pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.metrics import Array
+from loopwright.pipeline.metrics import Array
 
 SETTLINGS = 4  # of a segment
 SHORTEST, LONGEST = 64, 4096  # rows of a segment

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.cells import TEMPERATURES
-from pipeline.historian.character import runs_of
-from pipeline.historian.export import Series
-from pipeline.historian.findings import Finding
-from pipeline.historian.guessing import seen_range
-from pipeline.historian.missing_codes import CODES
-from pipeline.historian.pace import in_words
-from pipeline.historian.tags import KEEP, Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.cells import TEMPERATURES
+from loopwright.pipeline.historian.character import runs_of
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.findings import Finding
+from loopwright.pipeline.historian.guessing import seen_range
+from loopwright.pipeline.historian.missing_codes import CODES
+from loopwright.pipeline.historian.pace import in_words
+from loopwright.pipeline.historian.tags import KEEP, Tag
+from loopwright.pipeline.metrics import Array
 
 Where = NDArray[np.bool_]
 Band = tuple[float, float]

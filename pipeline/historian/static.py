@@ -7,8 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.linear import BLOCKS, LEAST_ROWS, Blocks, answer_of, blocks_of, least_squares, rows_of, whole
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.linear import (
+    BLOCKS,
+    LEAST_ROWS,
+    Blocks,
+    answer_of,
+    blocks_of,
+    least_squares,
+    rows_of,
+    whole,
+)
+from loopwright.pipeline.metrics import Array
 
 SLOW = ((41, 81), (81, 161), (161, 321))  # lags beyond BLOCKS that share a coefficient; the last are left out first
 SETTLED = 0.15

@@ -10,9 +10,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from pipeline.historian.excitation import SEEN
-from pipeline.historian.findings import InputReport
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.excitation import SEEN
+from loopwright.pipeline.historian.findings import InputReport
+from loopwright.pipeline.metrics import Array
 
 MOVES = 24  # random ones
 AMPLITUDE, LARGEST = 0.05, 0.12  # of the range, to each side of the present value

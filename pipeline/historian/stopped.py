@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.historian.findings import Finding, counted
-from pipeline.historian.grid import Grid
-from pipeline.historian.missing_codes import apart_zeros
-from pipeline.historian.reason import Reason
-from pipeline.historian.static import explained
-from pipeline.historian.tags import Tag
-from pipeline.metrics import Array
+from loopwright.pipeline.historian.findings import Finding, counted
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.missing_codes import apart_zeros
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.static import explained
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.metrics import Array
 
 BETTER = 0.5  # of the other's squared error: then one of the two explains the PV
 

@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipeline.historian.date_forms import COMPACT, DATE, HOUR, plain_date
-from pipeline.historian.headers import TIME_UNITS, UNIT
-from pipeline.historian.numbers import NUMBER, plain
+from loopwright.pipeline.historian.date_forms import COMPACT, DATE, HOUR, plain_date
+from loopwright.pipeline.historian.headers import TIME_UNITS, UNIT
+from loopwright.pipeline.historian.numbers import NUMBER, plain
 
 ISO_DAY = re.compile(r"^\d{4}-\d\d-\d\d([T ].*)?$")
 LONGEST_UNIT = 14  # characters

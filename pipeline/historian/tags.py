@@ -12,12 +12,12 @@ from enum import Enum
 from pathlib import Path
 from typing import Literal
 
-from pipeline.config.plants import mistakes_of_mv
-from pipeline.errors import RecordError, nearest
-from pipeline.files import write_text
-from pipeline.historian.findings import InputReport
-from serving.manifest import MAX_NAME, Signal
-from serving.plain_values import shown
+from loopwright.pipeline.config.plants import mistakes_of_mv
+from loopwright.pipeline.errors import RecordError, nearest
+from loopwright.pipeline.files import write_text
+from loopwright.pipeline.historian.findings import InputReport
+from loopwright.serving.manifest import MAX_NAME, Signal
+from loopwright.serving.plain_values import shown
 
 ROLES = ("pv", "mv", "dv", "sp", "mode")
 SIGNAL_ROLES = ("pv", "mv", "dv")

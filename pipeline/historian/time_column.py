@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from pipeline.errors import RecordError, nearest
-from pipeline.historian.date_forms import HOUR, HOUR_DIGITS
-from pipeline.historian.day_counts import DAY_S, UnclearCountError
-from pipeline.historian.headers import split_header, time_header
-from pipeline.historian.table_head import kind_of_cell
-from pipeline.historian.times import SINCE_1970_S, Clock, clock_of, given_clock
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError, nearest
+from loopwright.pipeline.historian.date_forms import HOUR, HOUR_DIGITS
+from loopwright.pipeline.historian.day_counts import DAY_S, UnclearCountError
+from loopwright.pipeline.historian.headers import split_header, time_header
+from loopwright.pipeline.historian.table_head import kind_of_cell
+from loopwright.pipeline.historian.times import SINCE_1970_S, Clock, clock_of, given_clock
+from loopwright.pipeline.metrics import Array
 
 SAMPLE = 200  # cells of a column
 RISES = 0.9  # share of the steps that go one way

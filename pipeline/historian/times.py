@@ -12,12 +12,19 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from pipeline.errors import RecordError
-from pipeline.historian.date_forms import ELAPSED, MIDNIGHT, calendar_digits, form_of, other_forms, plain_date
-from pipeline.historian.day_counts import DAY_S, DAYS, SERIAL, UnclearCountError, days_of
-from pipeline.historian.headers import NO_UNITS, SPELLINGS, TIME_UNITS, TimeHeader, time_header
-from pipeline.historian.numbers import EITHER_SIGN
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.date_forms import (
+    ELAPSED,
+    MIDNIGHT,
+    calendar_digits,
+    form_of,
+    other_forms,
+    plain_date,
+)
+from loopwright.pipeline.historian.day_counts import DAY_S, DAYS, SERIAL, UnclearCountError, days_of
+from loopwright.pipeline.historian.headers import NO_UNITS, SPELLINGS, TIME_UNITS, TimeHeader, time_header
+from loopwright.pipeline.historian.numbers import EITHER_SIGN
+from loopwright.pipeline.metrics import Array
 
 ISO = re.compile(r"^\d{4}-\d\d-\d\d([T ]\d\d:\d\d(:\d\d([.,]\d+)?)?)?\s*(Z|[+-]\d\d:?(\d\d)?)?$", re.IGNORECASE)
 ZONE = re.compile(r"\d\s*(Z|[+-]\d\d:?(\d\d)?)$", re.IGNORECASE)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pipeline.historian.excitation import SEEN
-from pipeline.historian.findings import Finding, Verdict, counted
+from loopwright.pipeline.historian.excitation import SEEN
+from loopwright.pipeline.historian.findings import Finding, Verdict, counted
 
 
 def of_answers(pvs: Sequence[str], verdict: Verdict) -> list[Finding]:

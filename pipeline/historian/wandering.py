@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.cells import usual
-from pipeline.historian.findings import Finding
-from pipeline.historian.free_run import free_run
-from pipeline.historian.linear import NO_EFFECT, Linear
-from pipeline.metrics import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.historian.cells import usual
+from loopwright.pipeline.historian.findings import Finding
+from loopwright.pipeline.historian.free_run import free_run
+from loopwright.pipeline.historian.linear import NO_EFFECT, Linear
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.records.record import Record
 
 BLOCK = 20  # rows at least that one level is the mean of; more where the plant is slow
 LEVELS, MOST_LEVELS = 12, 2_000

@@ -12,9 +12,9 @@ from typing import Any
 
 import pyarrow as pa
 
-from pipeline.errors import RecordError
-from pipeline.historian.dialect import SAMPLE_LINES, names_of
-from pipeline.historian.table_head import Head, head_of_table
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.dialect import SAMPLE_LINES, names_of
+from loopwright.pipeline.historian.table_head import Head, head_of_table
 
 BLOCK = 1 << 15  # rows
 

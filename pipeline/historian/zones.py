@@ -10,9 +10,9 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordError
-from pipeline.historian.day_counts import DAY_S
-from pipeline.metrics import Array
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.day_counts import DAY_S
+from loopwright.pipeline.metrics import Array
 
 OFFSET = re.compile(r"^(?:UTC|GMT)?(?P<sign>[+-])(?P<hours>\d{1,2})(?::?(?P<minutes>\d\d))?$", re.IGNORECASE)
 HOUR_S = 3600.0

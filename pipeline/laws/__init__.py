@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from pipeline.laws.base import ControlLaw
-from pipeline.laws.fuzzy.fuzzy_feedforward import FuzzyFeedforward, FuzzyFeedforwardPi
-from pipeline.laws.fuzzy.fuzzy_feedforward_observer import FuzzyFeedforwardObserver
-from pipeline.laws.inverse.inverse import INC, INCAD, INCADEC
-from pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob
-from pipeline.laws.linearized.gauss_newton import GaussNewtonPid, MinimumVariance
-from pipeline.laws.linearized.linearized_pid import LinearizedPid
-from pipeline.laws.local.pid_networks import AutoPidNetwork, LocalPidNetwork
-from pipeline.laws.pid.pid import PID
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.laws.recursive.recursive_pid import RecursivePid
-from pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
-from pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
-from pipeline.laws.reference.pi_reference import PiReference
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.laws.fuzzy.fuzzy_feedforward import FuzzyFeedforward, FuzzyFeedforwardPi
+from loopwright.pipeline.laws.fuzzy.fuzzy_feedforward_observer import FuzzyFeedforwardObserver
+from loopwright.pipeline.laws.inverse.inverse import INC, INCAD, INCADEC
+from loopwright.pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob
+from loopwright.pipeline.laws.linearized.gauss_newton import GaussNewtonPid, MinimumVariance
+from loopwright.pipeline.laws.linearized.linearized_pid import LinearizedPid
+from loopwright.pipeline.laws.local.pid_networks import AutoPidNetwork, LocalPidNetwork
+from loopwright.pipeline.laws.pid.pid import PID
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.laws.recursive.recursive_pid import RecursivePid
+from loopwright.pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
+from loopwright.pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
+from loopwright.pipeline.laws.reference.pi_reference import PiReference
 
 LAWS: dict[str, type[ControlLaw]] = {
     INC.name: INC,

@@ -10,12 +10,12 @@ import torch
 from scipy.special import chdtri
 from torch import Tensor, nn
 
-from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, hold_numbers, require_single_loop
-from pipeline.laws.gain_update import PidForm, gain_update
-from pipeline.laws.ranges import OfRange, ascend, in_units
-from pipeline.models.memory import Memory, Named, Slot
-from pipeline.plants.signals import Signals
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import ControlLaw, hold_numbers, require_single_loop
+from loopwright.pipeline.laws.gain_update import PidForm, gain_update
+from loopwright.pipeline.laws.ranges import OfRange, ascend, in_units
+from loopwright.pipeline.models.memory import Memory, Named, Slot
+from loopwright.pipeline.plants.signals import Signals
 
 Three = tuple[float, float, float]
 CONFIDENCE = 0.99  # of the update criterion: noise alone triggers it in 1 % of the samples

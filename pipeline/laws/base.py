@@ -10,11 +10,11 @@ from typing import Any, ClassVar, Self, TypeAlias, TypeVar
 import torch
 from torch import Tensor, nn
 
-from pipeline.errors import LawError
-from pipeline.laws.rates import Rates, rates_of
-from pipeline.models.base import Model
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.rates import Rates, rates_of
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array, Simulator
 
 M = TypeVar("M", bound=Model)
 Stepped: TypeAlias = tuple[Tensor, Tensor, Tensor]

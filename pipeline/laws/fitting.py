@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Simulator
-from pipeline.tuning.responses import ANSWERS, SHORTEST, STEP, StepResponses
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.tuning.responses import ANSWERS, SHORTEST, STEP, StepResponses
 
 INSTEAD = "choose law 'predictive' or 'pid', or remove the section"
 

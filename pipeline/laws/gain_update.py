@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.base import hold_numbers
 
 LONGEST = 1e4  # periods; a time as long says only that there is no such action
 NEXT_TO_NOTHING = 1e-8  # share of its bound at which a gain counts as none

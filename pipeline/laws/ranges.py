@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any, Self, TypeVar
 
-from pipeline.errors import LawError
-from pipeline.plants.signals import Signals
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.plants.signals import Signals
 
 P = TypeVar("P")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from math import inf, isinf
 from typing import TypeAlias
 
-from pipeline.errors import LawError
-from pipeline.plants.signals import Signals
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.plants.signals import Signals
 
 Rates: TypeAlias = float | tuple[float | None, ...] | None
 """``mv_rate`` of a law [mv]: one number for all MVs, one for each with None for no limit, or None for none at all."""

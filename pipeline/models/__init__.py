@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from pipeline.models.base import Model, load_model
-from pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.lagged.arx import ArxPart
-from pipeline.models.lagged.nnarx_part import NnarxPart
-from pipeline.models.local.linearized import LinearizedPart
-from pipeline.models.local.local_models_part import LocalModelsPart
-from pipeline.models.part import Learnt, Part, Source
-from pipeline.models.state_space.state_space import StateSpacePart
-from pipeline.models.static.leverage_domain import DomainPart
-from pipeline.models.static.rbf_part import RbfPart
-from pipeline.models.training.network_parts import MlpPart
+from loopwright.pipeline.models.base import Model, load_model
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.lagged.arx import ArxPart
+from loopwright.pipeline.models.lagged.nnarx_part import NnarxPart
+from loopwright.pipeline.models.local.linearized import LinearizedPart
+from loopwright.pipeline.models.local.local_models_part import LocalModelsPart
+from loopwright.pipeline.models.part import Learnt, Part, Source
+from loopwright.pipeline.models.state_space.state_space import StateSpacePart
+from loopwright.pipeline.models.static.leverage_domain import DomainPart
+from loopwright.pipeline.models.static.rbf_part import RbfPart
+from loopwright.pipeline.models.training.network_parts import MlpPart
 
 MODELS: dict[str, type[Part]] = {
     RbfPart.model.kind: RbfPart,

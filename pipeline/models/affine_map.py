@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import torch
 from torch import Tensor, nn
 
-from pipeline.models.memory import Named
+from loopwright.pipeline.models.memory import Named
 
 
 class AffineMap(nn.Module):

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from pipeline.errors import ModelError
-from pipeline.files import draft_of
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.files import draft_of
 
 
 class Model(nn.Module, ABC):
@@ -70,7 +70,7 @@ def simulate(model: Model, start: Tensor, mv: Tensor) -> Tensor:
 
 def load_model(path: Path) -> Model:
     """The model in ``path``, whatever its kind; raises ModelError for a foreign or damaged file."""
-    from pipeline.models import MODELS
+    from loopwright.pipeline.models import MODELS
 
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, TypeVar
 import numpy as np
 import torch
 
-from pipeline.config.known import Known
-from pipeline.config.params import choose
-from pipeline.errors import ModelError
-from pipeline.metrics import per_region, r2, rmse
-from pipeline.models.base import Model
-from pipeline.models.training.regressors import Pairs, forward_pairs, inverse_pairs
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
+from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.config.params import choose
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.metrics import per_region, r2, rmse
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.training.regressors import Pairs, forward_pairs, inverse_pairs
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.records.record import Record
 
 if TYPE_CHECKING:
-    from pipeline.models.static.sweep import SweepResult
+    from loopwright.pipeline.models.static.sweep import SweepResult
 Regions = Mapping[str, tuple[float, float]]
 Result_co = TypeVar("Result_co", covariant=True)
 ROWS = 8192  # predicted in one call

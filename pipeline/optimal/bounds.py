@@ -1,4 +1,4 @@
-"""The stored bounds of a case: what ``pipeline.stages.bounds`` computed, as long as it still applies."""
+"""The stored bounds of a case: what ``loopwright.pipeline.stages.bounds`` computed, as long as it still applies."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import LawError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.metric import together
-from pipeline.files import digest
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.metric import together
+from loopwright.pipeline.files import digest
+from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = dict[str, dict[str, dict[str, float]]]
 SCHEMA = 1

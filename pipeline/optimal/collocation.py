@@ -5,9 +5,9 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from pipeline.plants.equations import EquationPlant, rk4_step
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.plants.equations import EquationPlant, rk4_step
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 
 def scaling(signals: tuple[Signal, ...]) -> tuple[Array, Array]:

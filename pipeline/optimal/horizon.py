@@ -9,11 +9,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.evaluation.metric import METRICS, Metric
-from pipeline.optimal.collocation import collocation, scaling, trace
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.metric import METRICS, Metric
+from loopwright.pipeline.optimal.collocation import collocation, scaling, trace
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
 
 # The plan is never allowed to leave the states' ranges by more than this fraction of them.
 MARGIN = 0.1

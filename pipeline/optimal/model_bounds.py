@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.engine.parallel import parallel_map
-from pipeline.errors import PipelineError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.metric import together
-from pipeline.files import digest, read_json, write_json
-from pipeline.optimal.bounds import Bounds
-from pipeline.optimal.sampled import EVERY, HORIZON, SampledHorizon, run_sampled
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.metric import together
+from loopwright.pipeline.files import digest, read_json, write_json
+from loopwright.pipeline.optimal.bounds import Bounds
+from loopwright.pipeline.optimal.sampled import EVERY, HORIZON, SampledHorizon, run_sampled
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 SCHEMA = 1
 ANSWERS = 3  # a hold lasts so many times as long as an answer of the plant; without a hold, the whole test

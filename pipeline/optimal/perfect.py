@@ -24,15 +24,15 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.evaluation.closed_loop import closed_loop_metrics
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.metric import METRICS, Metric
-from pipeline.optimal.horizon import Horizon, Plan
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import noise_draws
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.metric import METRICS, Metric
+from loopwright.pipeline.optimal.horizon import Horizon, Plan
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import noise_draws
 
 Score = Callable[[Scenario, Array, Array], dict[str, float]]
 """Figures of a closed loop, from the test, PVs (n, n_pv) and MVs (n, n_mv): ``Case.score``."""

@@ -9,10 +9,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pipeline.optimal.horizon import MOVE_WEIGHT
-from pipeline.plants.identified import IdentifiedPlant, shift_rows
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.optimal.horizon import MOVE_WEIGHT
+from loopwright.pipeline.plants.identified import IdentifiedPlant, shift_rows
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario
 
 HORIZON = (20, 60)  # least and most samples that a plan looks ahead
 EVERY = 4  # parts of the horizon: a plan is followed over one of them while its predictions come true

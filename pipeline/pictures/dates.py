@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axis import Axis
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
-from pipeline.metrics import Array
-from pipeline.pictures.drawing import time_axis
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.pictures.drawing import time_axis
 
 DAY_S = 86_400.0
 TICKS = (4, 12)  # fewest and most

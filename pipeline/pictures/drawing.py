@@ -15,10 +15,10 @@ from matplotlib.path import Path as Outline
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import Array
-from pipeline.evaluation.metric import NO_UNIT
-from serving.manifest import Signal
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import Array
+from loopwright.pipeline.evaluation.metric import NO_UNIT
+from loopwright.serving.manifest import Signal
 
 BASELINE_COLOUR = "#7f7f7f"
 PALETTE = ("#d55e00", "#0072b2", "#cc79a7", "#009e73", "#56b4e9", "#e69f00", "#8c564b", "#332288")

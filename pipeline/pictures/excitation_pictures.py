@@ -7,8 +7,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.historian.excerpt import evenly
-from pipeline.historian.excitation import (
+from loopwright.pipeline.historian.excerpt import evenly
+from loopwright.pipeline.historian.excitation import (
     ALIKE,
     ENOUGH_MOVES,
     FOLLOWS,
@@ -16,11 +16,11 @@ from pipeline.historian.excitation import (
     moves_of,
     spectra_of,
 )
-from pipeline.historian.findings import InputReport, Verdict
-from pipeline.historian.screening import Screened
-from pipeline.historian.spectra import Spectrum
-from pipeline.metrics import Array
-from pipeline.pictures.drawing import SIZE, STYLE
+from loopwright.pipeline.historian.findings import InputReport, Verdict
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.spectra import Spectrum
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.pictures.drawing import SIZE, STYLE
 
 POWER, COHERENCE, BAND, LIMIT = "#0072b2", "#d55e00", "#cccccc", "#882255"
 MOST_INPUTS = 6

@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.law_evidence import Array
-from pipeline.evaluation.model_evidence import identified_part
-from pipeline.pictures.drawing import (
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import Array
+from loopwright.pipeline.evaluation.model_evidence import identified_part
+from loopwright.pipeline.pictures.drawing import (
     PALETTE,
     SIZE,
     axis_label,
@@ -23,9 +23,9 @@ from pipeline.pictures.drawing import (
     symbol,
     time_axis,
 )
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.simulation.rests import local_gains
-from serving.manifest import Signal
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.simulation.rests import local_gains
+from loopwright.serving.manifest import Signal
 
 LAW, OTHER = PALETTE[1], "#8fb8d6"
 PANEL, WIDEST, LOWEST = (2.9, 1.9), 13.0, 3.2  # inches

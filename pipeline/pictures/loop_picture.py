@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PipelineError
-from pipeline.evaluation.metric import METRICS, Metric
-from pipeline.files import draft_of
-from pipeline.metrics import mv_travel
-from pipeline.plants.simulator import Simulator
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.evaluation.metric import METRICS, Metric
+from loopwright.pipeline.files import draft_of
+from loopwright.pipeline.metrics import mv_travel
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.serving.manifest import Signal
 
 Array = NDArray[np.float64]
 LATE = 10  # an error stays that is there over the last tenth of a run

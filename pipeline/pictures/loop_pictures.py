@@ -13,11 +13,11 @@ from matplotlib.patches import Patch
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline.evaluation.case import Case, Curve, Figure
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.law_evidence import BASE, Array, Loop
-from pipeline.evaluation.poor_laws import worst_cycle
-from pipeline.pictures.drawing import (
+from loopwright.pipeline.evaluation.case import Case, Curve, Figure
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import BASE, Array, Loop
+from loopwright.pipeline.evaluation.poor_laws import worst_cycle
+from loopwright.pipeline.pictures.drawing import (
     REFERENCE,
     SET_POINT,
     SHADES,
@@ -32,10 +32,10 @@ from pipeline.pictures.drawing import (
     signal_label,
     time_axis,
 )
-from pipeline.pictures.numbers import number, ratio
-from pipeline.pictures.words import curve_label, law_name, scenario_name
-from pipeline.simulation.scenario import NOISE_SUFFIX
-from serving.manifest import Signal
+from loopwright.pipeline.pictures.numbers import number, ratio
+from loopwright.pipeline.pictures.words import curve_label, law_name, scenario_name
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.serving.manifest import Signal
 
 SCALES = {"kc", "tau_i_s", "tau_d_s", "penalty"}  # info whose ratios matter, not its differences
 LIKE_CV = (

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.evaluation.case import Figure
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.law_evidence import Array
-from pipeline.pictures.drawing import PALETTE, SIZE, axis_label, scale, signal_label, time_axis
-from pipeline.pictures.numbers import number
+from loopwright.pipeline.evaluation.case import Figure
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import Array
+from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, axis_label, scale, signal_label, time_axis
+from loopwright.pipeline.pictures.numbers import number
 
 PREDICTED = PALETTE[1]
 ONE_STEP = {

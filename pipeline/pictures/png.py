@@ -7,8 +7,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.files import write_bytes
-from pipeline.pictures.drawing import lay_out
+from loopwright.pipeline.files import write_bytes
+from loopwright.pipeline.pictures.drawing import lay_out
 
 DPI = 100.0  # MLflow shows pictures in their own size
 

@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.pictures.drawing import SET_POINT, SIZE, colour_of, fit_labels, legend_below, signal_label, time_axis
-from pipeline.pictures.words import law_name
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.pictures.drawing import (
+    SET_POINT,
+    SIZE,
+    colour_of,
+    fit_labels,
+    legend_below,
+    signal_label,
+    time_axis,
+)
+from loopwright.pipeline.pictures.words import law_name
 
 DONE = "#56b4e9"  # neither the baseline's grey nor the first law's colour
 MOST = 600  # rows: more cannot be told apart

@@ -12,13 +12,13 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from pipeline.historian.character import runs_of
-from pipeline.historian.findings import TagReport
-from pipeline.historian.reason import Reason
-from pipeline.historian.screening import Screened
-from pipeline.metrics import Array
-from pipeline.pictures.dates import ExportTimes
-from pipeline.pictures.drawing import SIZE, STYLE, axis_label, legend_below
+from loopwright.pipeline.historian.character import runs_of
+from loopwright.pipeline.historian.findings import TagReport
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.pictures.dates import ExportTimes
+from loopwright.pipeline.pictures.drawing import SIZE, STYLE, axis_label, legend_below
 
 COLOURS = {
     Reason.EMPTY: "#bbbbbb", Reason.TEXT: "#8c564b", Reason.QUALITY: "#332288", Reason.SENTINEL: "#d55e00",

@@ -7,12 +7,12 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
-from pipeline.evaluation.stress.draws import Draw
-from pipeline.evaluation.stress.faults import STUCK
-from pipeline.evaluation.stress.summary import Growth, Summary
-from pipeline.pictures.drawing import STYLE, scale, signal_label, symbol, time_axis
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.simulation.simulate import Trajectory
+from loopwright.pipeline.evaluation.stress.draws import Draw
+from loopwright.pipeline.evaluation.stress.faults import STUCK
+from loopwright.pipeline.evaluation.stress.summary import Growth, Summary
+from loopwright.pipeline.pictures.drawing import STYLE, scale, signal_label, symbol, time_axis
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.simulation.simulate import Trajectory
 
 PANELS, COLUMNS, TICKS = 6, 3, 4
 BLUE, RED, GREY, GOLD = "#0072b2", "#d55e00", "#7f7f7f", "#e69f00"

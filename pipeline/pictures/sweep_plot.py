@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from pipeline.files import draft_of
+from loopwright.pipeline.files import draft_of
 
 if TYPE_CHECKING:
-    from pipeline.models.static.sweep import SweepResult
+    from loopwright.pipeline.models.static.sweep import SweepResult
 
 
 def draw(result: SweepResult, path: Path) -> None:

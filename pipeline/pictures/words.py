@@ -6,10 +6,10 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from pipeline.evaluation.case import Curve, Setting
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import BASE
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.evaluation.case import Curve, Setting
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import BASE
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 WORDS = frozenset({"old", "predictive", "two"})
 """Words in the names of laws that are no abbreviations."""

@@ -12,11 +12,11 @@ from typing import Any, ClassVar, Self
 import casadi as ca
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.plants.linearization import Linearization
-from pipeline.plants.simulator import Advance, AdvanceMany, Array, Simulator
-from pipeline.plants.steady import SteadyStates
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.simulator import Advance, AdvanceMany, Array, Simulator
+from loopwright.pipeline.plants.steady import SteadyStates
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PlantError
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import AdvanceMany, Array, Simulator
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import AdvanceMany, Array, Simulator
 
 SETTLE = 2000
 """Periods that the plant is given to come to rest at its start; a slower one is brought there by Newton's method."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array
 
 CERTAIN = 3.0  # standard errors by which the changes of a signal turn back before that is called noise
 

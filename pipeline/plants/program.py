@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.errors import PlantError
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,11 @@ from typing import Any, final
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.plants.program import Interface
-from pipeline.plants.simulator import Array
-from serving.errors import LoopwrightError
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.program import Interface
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.manifest import Signal
 
 NAME = re.compile(r"[A-Za-z0-9_.\-/:#]{1,64}")
 METHODS = ("start", "step", "measure")

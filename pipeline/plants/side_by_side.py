@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.identified import IdentifiedPlant, StateEquation
-from pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.identified import IdentifiedPlant, StateEquation
+from loopwright.pipeline.plants.simulator import Array, Simulator
 
 AdvanceRows = Callable[[Array, Array, Array, Array], Array]
 """``advance(x (n, n_x), mv (n, n_mv), dv (n, n_dv), p (n, n_p)) -> x (n, n_x)`` one period later."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from serving.manifest import Signal
+from loopwright.serving.manifest import Signal
 
 
 @dataclass(frozen=True, slots=True)

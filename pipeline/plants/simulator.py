@@ -10,9 +10,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PlantError
-from pipeline.plants.signals import Signals
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving.manifest import Signal
 
 Array = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ from typing import Any, final
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.plants.fmu.program import FmuFile
-from pipeline.plants.fmu.table import FmuTable, table_path
-from pipeline.plants.program import Program
-from pipeline.plants.python_file import EXAMPLE, PythonFile
-from pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.fmu.program import FmuFile
+from loopwright.pipeline.plants.fmu.table import FmuTable, table_path
+from loopwright.pipeline.plants.program import Program
+from loopwright.pipeline.plants.python_file import EXAMPLE, PythonFile
+from loopwright.pipeline.plants.simulator import Array, Simulator
 
 FMU = ".fmu"
 NOISE_SHARE = 0.002  # of a PV's range, where the file states no noise

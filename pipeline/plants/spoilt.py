@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.plants.simulator import AdvanceMany, Array, Simulator
+from loopwright.pipeline.plants.simulator import AdvanceMany, Array, Simulator
 
 SURE = 2.0  # standard deviations of what a record leaves open
 

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 GRID = 800  # points of the curve over the set point's range
 STARTS = 60  # random starts for the first point of the curve

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.validation import Validation
-from pipeline.pictures.words import law_name
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario
-from serving.controller import Controller
-from serving.manifest import Signal
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.pictures.words import law_name
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.serving.controller import Controller
+from loopwright.serving.manifest import Signal
 
 SHARE = 0.2  # a slider goes so far to both sides of a parameter's value
 MIDDLE_SPAN = 1.0  # of a slider whose parameter is 0

@@ -7,7 +7,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import ClassVar
 
-from pipeline.errors import PipelineError
+from loopwright.pipeline.errors import PipelineError
 
 HOST = "127.0.0.1"
 

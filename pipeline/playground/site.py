@@ -13,19 +13,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import pipeline.hosts
-import serving.page
-from pipeline.errors import PipelineError
-from pipeline.export.plant_graphs import PlantGraphs
-from pipeline.files import draft_folder_of, write_bytes, write_text
-from pipeline.playground.web_runtime import LICENCE, MODULE, WASM
-from serving.controller import Controller
+import loopwright.pipeline.hosts
+import loopwright.serving.page
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.export.plant_graphs import PlantGraphs
+from loopwright.pipeline.files import draft_folder_of, write_bytes, write_text
+from loopwright.pipeline.playground.web_runtime import LICENCE, MODULE, WASM
+from loopwright.serving.controller import Controller
 
 STATIC = Path(__file__).parent / "static"
 # The step and the loop are those of the hosts in Node and the browser.
-LOOP = Path(pipeline.hosts.__file__).parent / "javascript" / "controller.mjs"
+LOOP = Path(loopwright.pipeline.hosts.__file__).parent / "javascript" / "controller.mjs"
 # The operator's page has the same look, and the only copy of uPlot.
-OPERATORS = Path(serving.page.__file__).parent / "static"
+OPERATORS = Path(loopwright.serving.page.__file__).parent / "static"
 SHARED = ("page.css", "uPlot.min.css", "uPlot.iife.min.js", "uPlot-LICENSE", "format.js", "icon.svg")
 PAGE = "index.html"
 TRANSITION, MEASUREMENT = "plant-transition.onnx", "plant-measurement.onnx"

@@ -1,6 +1,6 @@
 """onnxruntime-web: fetched once by npm, its digests known beforehand, then kept on this machine.
 
-``python -m pipeline.playground.web_runtime`` fetches it, so that the playground later needs no network.
+``python -m loopwright.pipeline.playground.web_runtime`` fetches it, so that the playground later needs no network.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from pipeline.errors import PipelineError
-from pipeline.files import draft_folder_of, sha256
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.files import draft_folder_of, sha256
 
 VERSION = "1.30.0"  # as in npm/package.json
 MODULE, WASM = "ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.wasm"

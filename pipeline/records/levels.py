@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.metrics import Array
+from loopwright.pipeline.metrics import Array
 
 MOST = 3
 NEAR = 1e-3  # of the span: values of one level

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.metrics import Array, mae
+from loopwright.pipeline.metrics import Array, mae
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordError
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
-from pipeline.records.record_file import Table, column_name, read_table, write_table
-from serving.manifest import Signal
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record_file import Table, column_name, read_table, write_table
+from loopwright.serving.manifest import Signal
 
 STEP_TOLERANCE = 1e-3  # of the period: what a logger's rounded time stamps may stray
 MV_TOLERANCE = 1e-9  # of a signal's span

@@ -17,9 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.errors import RecordError
-from pipeline.files import draft_of
-from serving.manifest import Signal
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.files import draft_of
+from loopwright.serving.manifest import Signal
 
 METADATA_KEY = b"loopwright.record"
 COLUMN = re.compile(r"^\s*(?P<name>.*?)\s*\[(?P<unit>.*)\]\s*$")

@@ -10,8 +10,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.files import draft_of
-from pipeline.metrics import Array
+from loopwright.pipeline.files import draft_of
+from loopwright.pipeline.metrics import Array
 
 SET_POINTS = "set_points.npz"
 """Beside the record of an own plant: what stage `screen` found of its loops."""

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.files import read_json
-from pipeline.historian.cells import usual
-from pipeline.historian.wandering import Levels, levels_of
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.files import read_json
+from loopwright.pipeline.historian.cells import usual
+from loopwright.pipeline.historian.wandering import Levels, levels_of
 
 SCREENING = "screening.json"  # beside the record
 GONE = "the model explains the rest, no drift is left, and there is nothing to do"

@@ -10,25 +10,25 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.errors import ReportError
-from pipeline.evaluation.case import Figure
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.model_evidence import candidates, identified_part
-from pipeline.pictures.drawing import STYLE, CasePicture, Draw
-from pipeline.pictures.identified_pictures import free_run_picture, gains_picture, step_responses_picture
-from pipeline.pictures.loop_pictures import (
+from loopwright.pipeline.errors import ReportError
+from loopwright.pipeline.evaluation.case import Figure
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.model_evidence import candidates, identified_part
+from loopwright.pipeline.pictures.drawing import STYLE, CasePicture, Draw
+from loopwright.pipeline.pictures.identified_pictures import free_run_picture, gains_picture, step_responses_picture
+from loopwright.pipeline.pictures.loop_pictures import (
     cycle_picture,
     disturbance_picture,
     info_picture,
     loops_picture,
     overview_picture,
 )
-from pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
-from pipeline.pictures.png import save
-from pipeline.pictures.replay_pictures import replay_picture
-from pipeline.pictures.words import scenario_name
-from pipeline.report.worse import shipped_laws, worst_test
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
+from loopwright.pipeline.pictures.png import save
+from loopwright.pipeline.pictures.replay_pictures import replay_picture
+from loopwright.pipeline.pictures.words import scenario_name
+from loopwright.pipeline.report.worse import shipped_laws, worst_test
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 MODEL_PICTURES: tuple[tuple[str, Draw, str], ...] = (
     ("free_run", free_run_picture, "The free run over rows that the fit never saw, and its residual"),

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import LawEvidence, Row
-from pipeline.evaluation.validation import GateRecord, GateResult, LawResult, PaperResult, Titles, Validation
-from pipeline.files import digest
-from pipeline.pictures.words import law_name
-from pipeline.report.verdicts import Judged
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import LawEvidence, Row
+from loopwright.pipeline.evaluation.validation import GateRecord, GateResult, LawResult, PaperResult, Titles, Validation
+from loopwright.pipeline.files import digest
+from loopwright.pipeline.pictures.words import law_name
+from loopwright.pipeline.report.verdicts import Judged
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 DEFAULT = "mae"  # the metric that the digests of gates leave out
 

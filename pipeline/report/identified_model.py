@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.model_evidence import identified_part
-from pipeline.pictures.drawing import axis_label, gain_unit
-from pipeline.pictures.numbers import figure, number
-from pipeline.report.drift import drift_answers
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.model_evidence import identified_part
+from loopwright.pipeline.pictures.drawing import axis_label, gain_unit
+from loopwright.pipeline.pictures.numbers import figure, number
+from loopwright.pipeline.report.drift import drift_answers
 
 MOST_TRIED = 12  # candidates in the table, the best first
 COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import BASE
-from pipeline.evaluation.metric import NO_UNIT
-from pipeline.pictures.drawing import axis_label
-from pipeline.pictures.words import given_text
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import BASE
+from loopwright.pipeline.evaluation.metric import NO_UNIT
+from loopwright.pipeline.pictures.drawing import axis_label
+from loopwright.pipeline.pictures.words import given_text
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 
 def law_row(evidence: Evidence, law: str) -> dict[str, Any]:

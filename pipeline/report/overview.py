@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.evaluation.standing import LawStanding, Standing, tally
-from pipeline.pictures.numbers import ratio
-from pipeline.report.templating import REGISTRY_URL, render, write_pages
+from loopwright.pipeline.evaluation.standing import LawStanding, Standing, tally
+from loopwright.pipeline.pictures.numbers import ratio
+from loopwright.pipeline.report.templating import REGISTRY_URL, render, write_pages
 
 Count = tuple[int, int]
 

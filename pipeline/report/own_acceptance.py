@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pipeline.evaluation.closed_loop import FAR
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.known import known_rows
-from pipeline.evaluation.law_evidence import lock_up_text
-from pipeline.evaluation.metric import NO_UNIT
-from pipeline.evaluation.model_evidence import IDENTIFIED
-from pipeline.evaluation.proof import statements
-from pipeline.evaluation.validation import Statement
-from pipeline.historian.pace import in_words
-from pipeline.historian.step_test import ALONE, HOLDS, LARGEST, MOVES
-from pipeline.pictures.drawing import axis_label
-from pipeline.pictures.numbers import number, times
-from pipeline.pictures.words import law_name, scenario_name
-from pipeline.report.worse import limit_of, shipped_laws
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.evaluation.closed_loop import FAR
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.known import known_rows
+from loopwright.pipeline.evaluation.law_evidence import lock_up_text
+from loopwright.pipeline.evaluation.metric import NO_UNIT
+from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
+from loopwright.pipeline.evaluation.proof import statements
+from loopwright.pipeline.evaluation.validation import Statement
+from loopwright.pipeline.historian.pace import in_words
+from loopwright.pipeline.historian.step_test import ALONE, HOLDS, LARGEST, MOVES
+from loopwright.pipeline.pictures.drawing import axis_label
+from loopwright.pipeline.pictures.numbers import number, times
+from loopwright.pipeline.pictures.words import law_name, scenario_name
+from loopwright.pipeline.report.worse import limit_of, shipped_laws
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 UNMEASURED = "not measured"
 

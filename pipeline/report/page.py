@@ -7,26 +7,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import lock_up_text
-from pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
-from pipeline.evaluation.standing import because, by_reason
-from pipeline.evaluation.validation import FILE, reference_words
-from pipeline.evaluation.verdicts import Claims
-from pipeline.optimal.bounds import bounded
-from pipeline.pictures.drawing import CasePicture
-from pipeline.pictures.numbers import number, ratio
-from pipeline.pictures.words import law_name, scenario_name
-from pipeline.report.figures import draw_all, main_words
-from pipeline.report.for_programs import validation
-from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
-from pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
-from pipeline.report.own_acceptance import step_test_to_run
-from pipeline.report.templating import REGISTRY_URL, render, write_pages
-from pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
-from pipeline.report.worse import against, beyond_reach, shipped_laws
-from pipeline.tuning.pid_forms import PidForms, whole_span
-from pipeline.tuning.rules import PidSettings
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import lock_up_text
+from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
+from loopwright.pipeline.evaluation.standing import because, by_reason
+from loopwright.pipeline.evaluation.validation import FILE, reference_words
+from loopwright.pipeline.evaluation.verdicts import Claims
+from loopwright.pipeline.optimal.bounds import bounded
+from loopwright.pipeline.pictures.drawing import CasePicture
+from loopwright.pipeline.pictures.numbers import number, ratio
+from loopwright.pipeline.pictures.words import law_name, scenario_name
+from loopwright.pipeline.report.figures import draw_all, main_words
+from loopwright.pipeline.report.for_programs import validation
+from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
+from loopwright.pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
+from loopwright.pipeline.report.own_acceptance import step_test_to_run
+from loopwright.pipeline.report.templating import REGISTRY_URL, render, write_pages
+from loopwright.pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
+from loopwright.pipeline.report.worse import against, beyond_reach, shipped_laws
+from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span
+from loopwright.pipeline.tuning.rules import PidSettings
 
 MOST_HEADLINES = 5
 

@@ -11,13 +11,13 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pipeline.config.params import PARAMS_FILE, entries, sections
-from pipeline.errors import PipelineError
-from pipeline.evaluation.metric import with_unit
-from pipeline.evaluation.standing import LawStanding, Standing, by_reason, tally, withheld_in
-from pipeline.evaluation.validation import FILE, Validation
-from pipeline.pictures.numbers import ratio
-from pipeline.simulation import NOISE_SUFFIX
+from loopwright.pipeline.config.params import PARAMS_FILE, entries, sections
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.evaluation.metric import with_unit
+from loopwright.pipeline.evaluation.standing import LawStanding, Standing, by_reason, tally, withheld_in
+from loopwright.pipeline.evaluation.validation import FILE, Validation
+from loopwright.pipeline.pictures.numbers import ratio
+from loopwright.pipeline.simulation import NOISE_SUFFIX
 
 WIDTH = 120
 AHEAD = 0.99  # ratio to the bound below which a remark says why

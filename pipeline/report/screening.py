@@ -7,14 +7,14 @@ from pathlib import Path
 
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.files import write_text
-from pipeline.historian.reason import Reason
-from pipeline.historian.screening import Screened
-from pipeline.historian.step_test import StepTest
-from pipeline.pictures.excitation_pictures import inputs, verdict
-from pipeline.pictures.png import png
-from pipeline.pictures.screening_pictures import details, readings, times_of, trends
-from pipeline.report.templating import render
+from loopwright.pipeline.files import write_text
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.step_test import StepTest
+from loopwright.pipeline.pictures.excitation_pictures import inputs, verdict
+from loopwright.pipeline.pictures.png import png
+from loopwright.pipeline.pictures.screening_pictures import details, readings, times_of, trends
+from loopwright.pipeline.report.templating import render
 
 VERDICTS = {
     "yes": "These data can carry a model.",

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.evaluation.stress.draws import Draw
-from pipeline.evaluation.stress.faults import KINDS, MOST_SPAN, MOST_ZERO, STROKE, STUCK_FOR
-from pipeline.evaluation.stress.loops import Outcome, Stress
-from pipeline.evaluation.stress.summary import QUANTILES, Summary, table
-from pipeline.files import draft_of
-from pipeline.pictures.numbers import number
-from pipeline.pictures.png import save
-from pipeline.pictures.stress_pictures import growth_canvas, loop_canvas, spread_canvas
-from pipeline.report.templating import render, write_pages
-from serving.manifest import Signal
+from loopwright.pipeline.evaluation.stress.draws import Draw
+from loopwright.pipeline.evaluation.stress.faults import KINDS, MOST_SPAN, MOST_ZERO, STROKE, STUCK_FOR
+from loopwright.pipeline.evaluation.stress.loops import Outcome, Stress
+from loopwright.pipeline.evaluation.stress.summary import QUANTILES, Summary, table
+from loopwright.pipeline.files import draft_of
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.png import save
+from loopwright.pipeline.pictures.stress_pictures import growth_canvas, loop_canvas, spread_canvas
+from loopwright.pipeline.report.templating import render, write_pages
+from loopwright.serving.manifest import Signal
 
 TABLE = "plants.parquet"
 

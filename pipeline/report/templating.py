@@ -9,9 +9,9 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from pipeline.files import write_text
-from pipeline.pictures.numbers import figure, kilobytes, ratio, times
-from serving.words import harmless
+from loopwright.pipeline.files import write_text
+from loopwright.pipeline.pictures.numbers import figure, kilobytes, ratio, times
+from loopwright.serving.words import harmless
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"
 """Where `make registry` serves the registry, unless another port was asked for."""
@@ -26,7 +26,7 @@ def render(name: str, content: Mapping[str, Any]) -> str:
 def _environment(escapes: bool) -> Environment:
     """The templates, each compiled once a process."""
     environment = Environment(
-        loader=PackageLoader("pipeline.report"),
+        loader=PackageLoader("loopwright.pipeline.report"),
         autoescape=escapes,
         undefined=StrictUndefined,
         trim_blocks=True,

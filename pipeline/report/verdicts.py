@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.evaluation.case import Curve, PaperFigure, PaperTable, Requirement
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.validation import Statement
-from pipeline.evaluation.verdicts import ABSOLUTE, RELATIVE, Claims, Reason, close, plain_reason
-from pipeline.pictures.numbers import number
-from pipeline.pictures.words import curve_label
-from pipeline.report.own_acceptance import own_acceptance
+from loopwright.pipeline.evaluation.case import Curve, PaperFigure, PaperTable, Requirement
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.verdicts import ABSOLUTE, RELATIVE, Claims, Reason, close, plain_reason
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import curve_label
+from loopwright.pipeline.report.own_acceptance import own_acceptance
 
 FINE = 5  # digits shown of a figure that has to be near
 RULE = (

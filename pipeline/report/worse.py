@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import lock_up_text
-from pipeline.evaluation.poor_laws import worst_cycle
-from pipeline.pictures.numbers import number
-from pipeline.pictures.words import law_name
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import lock_up_text
+from loopwright.pipeline.evaluation.poor_laws import worst_cycle
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 
 @dataclass(frozen=True, slots=True)

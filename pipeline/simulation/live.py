@@ -13,11 +13,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.errors import PlantError
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.simulation.timetable import Timetable
-from serving.guard import Sample
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.simulation.timetable import Timetable
+from loopwright.serving.guard import Sample
+from loopwright.serving.manifest import Signal
 
 WINDOW_S = 60.0
 WIDTH = 60

@@ -20,10 +20,10 @@ from asyncua.crypto.truststore import TrustStore
 from asyncua.crypto.validator import CertificateValidator, CertificateValidatorOptions
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from pipeline.errors import PlantError
-from pipeline.plants.equations import EquationPlant, rk4_step
-from pipeline.plants.simulator import Advance, Array, Simulator
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.equations import EquationPlant, rk4_step
+from loopwright.pipeline.plants.simulator import Advance, Array, Simulator
+from loopwright.serving.manifest import Signal
 
 NAMESPACE = "urn:loopwright:plant"
 APPLICATION = "urn:loopwright:plant:server"

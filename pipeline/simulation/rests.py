@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Simulator
 
 RESTING = 2_000  # periods that a plant is given to come to rest
 LOOK = 100  # periods between two looks whether it has

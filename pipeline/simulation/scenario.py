@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.files import digest
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.simulation import NOISE_SUFFIX as NOISE_SUFFIX
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.files import digest
+from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.simulation import NOISE_SUFFIX as NOISE_SUFFIX
 
 
 @dataclass(frozen=True, slots=True, eq=False)

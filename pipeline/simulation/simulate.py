@@ -9,11 +9,11 @@ from math import isfinite
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.errors import PlantError
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.noise import coloured
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.noise import coloured
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.simulation.scenario import Scenario
 
 DV_DRAW = 1  # beside the seed of a loop: the noise of its measured disturbances is drawn by itself
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.errors import ParamsError, nearest
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import noise_draws
-from serving.manifest import Signal
+from loopwright.pipeline.errors import ParamsError, nearest
+from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import noise_draws
+from loopwright.serving.manifest import Signal
 
 SETTLE_SAMPLES = 80  # after the last event, where no duration was asked for
 MAX_SAMPLES = 10_000_000

@@ -1,11 +1,11 @@
 """Bounds that no controller can beat by much: perfect-model NMPC and the offline optimum.
 
-``pipeline.optimal.perfect`` says what they know and what they do not. A plant with a discrete MV is replaced by
-its ``relaxed()``. The offline optimum is searched from the NMPC's moves too; where no plan is better than the
-NMPC, the NMPC's figures stand for the optimum (``from_nmpc``).
+``loopwright.pipeline.optimal.perfect`` says what they know and what they do not. A plant with a discrete MV is replaced
+by its ``relaxed()``. The offline optimum is searched from the NMPC's moves too; where no plan is better than the NMPC,
+the NMPC's figures stand for the optimum (``from_nmpc``).
 
 ``loopwright bounds CASE`` computes both for every scenario of a case, NMPC also with measurement noise, and
-stores them beside the case. ``pipeline.optimal.bounds.stored_bounds`` reads them.
+stores them beside the case. ``loopwright.pipeline.optimal.bounds.stored_bounds`` reads them.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.engine.parallel import as_done
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.metric import mean_of_draws
-from pipeline.files import write_text
-from pipeline.optimal.bounds import DEFAULTS, SCHEMA, bounded, bounds_path, kinds, problem, read_stored
-from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
-from pipeline.plants.equations import equations
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.engine.parallel import as_done
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.metric import mean_of_draws
+from loopwright.pipeline.files import write_text
+from loopwright.pipeline.optimal.bounds import DEFAULTS, SCHEMA, bounded, bounds_path, kinds, problem, read_stored
+from loopwright.pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
+from loopwright.pipeline.plants.equations import equations
+from loopwright.pipeline.simulation.scenario import Scenario
 
 NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW for every further draw
 DRAW = 1_000

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import all_cases
-from pipeline.cases.own_ensemble import LAW_PART, MEMBERS, MODEL_SET, OwnEnsemble
-from pipeline.config.exports import ExportParams, is_exported, screened_record
-from pipeline.config.params import (
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.cases.own_ensemble import LAW_PART, MEMBERS, MODEL_SET, OwnEnsemble
+from loopwright.pipeline.config.exports import ExportParams, is_exported, screened_record
+from loopwright.pipeline.config.params import (
     CaseParams,
     ControllerParams,
     ModelParams,
@@ -25,22 +25,22 @@ from pipeline.config.params import (
     read_section,
     sections,
 )
-from pipeline.config.plants import PlantParams, own_plants
-from pipeline.errors import ParamsError, PipelineError
-from pipeline.evaluation.case import Case
-from pipeline.historian.agreement import check_agreement, check_period
-from pipeline.historian.exported import signal_tags
-from pipeline.historian.tags import check_tags
-from pipeline.laws import LAWS
-from pipeline.laws.fitting import require_fit
-from pipeline.models.local.linearized import LinearizedPart
-from pipeline.models.part import Source
-from pipeline.models.training.network_parts import trainer_of
-from pipeline.optimal.bounds import bounds_path, stored_bounds
-from pipeline.stages.excite import excitations
-from pipeline.stages.fit import parts_of
-from pipeline.stages.paths import DATA, WORK, record_folder
-from serving.errors import LoopwrightError
+from loopwright.pipeline.config.plants import PlantParams, own_plants
+from loopwright.pipeline.errors import ParamsError, PipelineError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.historian.agreement import check_agreement, check_period
+from loopwright.pipeline.historian.exported import signal_tags
+from loopwright.pipeline.historian.tags import check_tags
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.laws.fitting import require_fit
+from loopwright.pipeline.models.local.linearized import LinearizedPart
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.models.training.network_parts import trainer_of
+from loopwright.pipeline.optimal.bounds import bounds_path, stored_bounds
+from loopwright.pipeline.stages.excite import excitations
+from loopwright.pipeline.stages.fit import parts_of
+from loopwright.pipeline.stages.paths import DATA, WORK, record_folder
+from loopwright.serving.errors import LoopwrightError
 
 REPORT = "screening.json"
 FROM_A_WHEEL = (

@@ -1,4 +1,4 @@
-"""Stage code: ``python -m pipeline.stages.code`` lists the files that every other stage runs.
+"""Stage code: ``python -m loopwright.pipeline.stages.code`` lists the files that every other stage runs.
 
 work/code/<stage>-<case>.json (<stage>.json of a stage over all cases) holds the sha256 of each file
 of ``pipeline`` and ``serving`` that the stage imports, at whatever depth; of the data files that dvc.yaml cannot list
@@ -18,42 +18,50 @@ from typing import Any
 
 import grimp
 
-from pipeline.cases import all_cases
-from pipeline.config.exports import ExportParams, is_exported
-from pipeline.config.params import entries, read_section, sections
-from pipeline.config.plants import PlantParams
-from pipeline.engine.command import run_stage
-from pipeline.engine.stage_files import DATA, EVERY
-from pipeline.evaluation.grounds import SCREENING
-from pipeline.files import digest, sha256, write_json
-from pipeline.records.set_points import SET_POINTS
-from pipeline.stages.paths import WORK
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.config.exports import ExportParams, is_exported
+from loopwright.pipeline.config.params import entries, read_section, sections
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.engine.stage_files import DATA, EVERY
+from loopwright.pipeline.evaluation.grounds import SCREENING
+from loopwright.pipeline.files import digest, sha256, write_json
+from loopwright.pipeline.records.set_points import SET_POINTS
+from loopwright.pipeline.stages.paths import WORK
 
-PACKAGES = ("pipeline", "serving")
+PIPELINE, SERVING = PACKAGES = ("loopwright.pipeline", "loopwright.serving")
 STAGES = ("screen", "excite", "fit", "design", "validate", "report")  # of one case each
 LAST = ("overview", "publish")
+
+
+def _of(package: str, *names: str) -> tuple[str, ...]:
+    """Modules of a package by their full names."""
+    return tuple(f"{package}.{name}" for name in names)
+
+
 # What carries a stage's work from place to place and has no part in its result.
 CARRIERS = (
-    *("pipeline", "pipeline.config", "pipeline.engine", "pipeline.errors", "pipeline.files", "pipeline.stages.paths"),
-    *("serving", "serving.errors"),
+    *(PIPELINE, *_of(PIPELINE, "config", "engine", "errors", "files", "stages.paths")),
+    *(SERVING, *_of(SERVING, "errors")),
 )
 # A stage asks a case for its plant before it is validated: which tests the case has changes nothing.
-TESTS = ("pipeline.evaluation", "pipeline.simulation.scenario")
+TESTS = _of(PIPELINE, "evaluation", "simulation.scenario")
 # Stage -> what it imports without a part in its result: by whom ("" is anybody), and what, with all that is in it.
 APART = {
-    "excite": {("", what) for what in (*TESTS, "serving.manifest")},
+    "excite": {("", what) for what in (*TESTS, *_of(SERVING, "manifest"))},
     "fit": {
-        *(("", what) for what in ("pipeline.simulation.scenario", "serving.manifest")),
-        *((who, "pipeline.evaluation") for who in ("pipeline.cases", "pipeline.models", "pipeline.pictures")),
+        *(("", what) for what in (*_of(PIPELINE, "simulation.scenario"), *_of(SERVING, "manifest"))),
+        *((who, f"{PIPELINE}.evaluation") for who in _of(PIPELINE, "cases", "models", "pictures")),
         # A fit asks whether the record proves its model: the words of that have no part in the answer.
-        *(("pipeline.stages", "pipeline.evaluation.case"), ("pipeline.evaluation", "pipeline.evaluation.validation")),
+        (f"{PIPELINE}.stages", f"{PIPELINE}.evaluation.case"),
+        (f"{PIPELINE}.evaluation", f"{PIPELINE}.evaluation.validation"),
     },
     "design": {
         *(("", what) for what in TESTS),
         # What trained the models has had its effect.
-        *(("pipeline.models", what) for what in ("pipeline.metrics", "pipeline.records", "pipeline.historian")),
+        *((f"{PIPELINE}.models", what) for what in _of(PIPELINE, "metrics", "records", "historian")),
         # The parity gate says whether the runtime agrees with the law, and changes nothing.
-        *(("", what) for what in ("serving.controller", "serving.graph_audit")),
+        *(("", what) for what in _of(SERVING, "controller", "graph_audit")),
     },
 }
 # Stage -> the modules beside case.py that it loads.
@@ -140,7 +148,7 @@ def modules(stage: str, case: str = "") -> set[str]:
     """The modules that have a part in the stage's result, by what imports what."""
     imports = graph()
     reached: set[str] = set()
-    todo = [f"pipeline.stages.{stage}"]
+    todo = [f"{PIPELINE}.stages.{stage}"]
     if case and stage != "screen":  # which knows no case, only its files
         own = [beside(case, name) for name in ("case", *BESIDE.get(stage, ()))]
         todo += [module for module in own if module in imports.modules]
@@ -148,7 +156,7 @@ def modules(stage: str, case: str = "") -> set[str]:
         module = todo.pop()
         reached.add(module)
         # The list of cases imports them all; this stage runs its own alone.
-        used = imports.find_modules_directly_imported_by(module) if module != "pipeline.cases" else set()
+        used = imports.find_modules_directly_imported_by(module) if module != f"{PIPELINE}.cases" else set()
         todo += [m for m in used - reached if not _within(m, CARRIERS) and not _apart(stage, module, m)]
     return reached
 
@@ -167,7 +175,7 @@ def beside(case: str, name: str) -> str:
 
 def path_of(root: Path, module: str) -> Path:
     """The file of a module, whether there or not; of a package its __init__.py."""
-    path = root.joinpath(*module.split("."))
+    path = root.joinpath(*module.split(".")[1:])  # the folders lie at the root
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 
 

@@ -13,25 +13,25 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import all_cases
-from pipeline.config.params import ControllerParams, choose, parse
-from pipeline.engine.command import reason, run_stage
-from pipeline.engine.origin import commit
-from pipeline.engine.parallel import parallel_map
-from pipeline.errors import LawError, PipelineError, WithheldError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.known import question
-from pipeline.evaluation.law_evidence import BASE
-from pipeline.evaluation.model_evidence import IDENTIFIED
-from pipeline.evaluation.proof import sign_doubts
-from pipeline.export.gate import export
-from pipeline.files import digest, read_json, write_json
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.laws.fitting import require_fit
-from pipeline.models import load_model
-from pipeline.models.base import Model
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder, old_loop_file
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.config.params import ControllerParams, choose, parse
+from loopwright.pipeline.engine.command import reason, run_stage
+from loopwright.pipeline.engine.origin import commit
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.errors import LawError, PipelineError, WithheldError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.known import question
+from loopwright.pipeline.evaluation.law_evidence import BASE
+from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
+from loopwright.pipeline.evaluation.proof import sign_doubts
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.files import digest, read_json, write_json
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.laws.fitting import require_fit
+from loopwright.pipeline.models import load_model
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder, old_loop_file
 
 REFUSALS = (PipelineError, np.linalg.LinAlgError)
 """Errors of a law that a plant does not suit; any other error is a mistake in the program."""

@@ -7,15 +7,15 @@ import sys
 from functools import partial
 from pathlib import Path
 
-from pipeline.cases import all_cases, beside
-from pipeline.config.params import RecordParams, choose, parse
-from pipeline.engine.command import run_stage
-from pipeline.engine.parallel import parallel_map
-from pipeline.evaluation.case import Case
-from pipeline.excitation import EXCITATIONS, Excitation
-from pipeline.files import write_json
-from pipeline.plants.simulator import Simulator
-from pipeline.stages.paths import record_folder
+from loopwright.pipeline.cases import all_cases, beside
+from loopwright.pipeline.config.params import RecordParams, choose, parse
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.excitation import EXCITATIONS, Excitation
+from loopwright.pipeline.files import write_json
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.stages.paths import record_folder
 
 
 def excite(name: str) -> None:

@@ -13,19 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.cases import all_cases, beside
-from pipeline.config.params import ModelParams, choose, parse
-from pipeline.engine.command import run_stage
-from pipeline.engine.parallel import parallel_map
-from pipeline.errors import ParamsError, PipelineError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.model_evidence import IDENTIFIED
-from pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
-from pipeline.files import write_json
-from pipeline.models import MODELS, Part, Source
-from pipeline.models.part import Groundwork, done, groundworks
-from pipeline.records.record import Record
-from pipeline.stages.paths import model_folder
+from loopwright.pipeline.cases import all_cases, beside
+from loopwright.pipeline.config.params import ModelParams, choose, parse
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.errors import ParamsError, PipelineError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
+from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
+from loopwright.pipeline.files import write_json
+from loopwright.pipeline.models import MODELS, Part, Source
+from loopwright.pipeline.models.part import Groundwork, done, groundworks
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.stages.paths import model_folder
 
 Shared = Mapping[int, Mapping[Groundwork[Any], Any]]
 """Data seed -> groundwork -> its result."""
@@ -164,7 +164,7 @@ def _learn(
     learnt = parts[name].learn(source)
     learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
     if learnt.sweep is not None:
-        from pipeline.pictures.sweep_plot import draw  # here, because matplotlib takes a second to load
+        from loopwright.pipeline.pictures.sweep_plot import draw  # here, because matplotlib takes a second to load
 
         learnt.sweep.save(folder / "sweep.json")
         draw(learnt.sweep, folder / "sweep.png")

@@ -6,12 +6,12 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from pipeline.config.params import sections
-from pipeline.engine.command import run_stage
-from pipeline.evaluation.standing import Standing
-from pipeline.evaluation.validation import FILE
-from pipeline.report.overview import PAGES, write_overview
-from pipeline.stages.paths import ARTIFACTS
+from loopwright.pipeline.config.params import sections
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.evaluation.standing import Standing
+from loopwright.pipeline.evaluation.validation import FILE
+from loopwright.pipeline.report.overview import PAGES, write_overview
+from loopwright.pipeline.stages.paths import ARTIFACTS
 
 
 def overview() -> None:

@@ -1,13 +1,13 @@
-"""Stage publish: ``python -m pipeline.stages.publish`` writes the store and published.json."""
+"""Stage publish: ``python -m loopwright.pipeline.stages.publish`` writes the store and published.json."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
-from pipeline.engine.command import run_stage
-from pipeline.files import write_json
-from pipeline.tracking.publish import publish as write_store
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.files import write_json
+from loopwright.pipeline.tracking.publish import publish as write_store
 
 RECEIPT = Path("published.json")
 

@@ -6,16 +6,16 @@ import hashlib
 import sys
 from pathlib import Path
 
-from pipeline.cases import all_cases, beside
-from pipeline.config.params import CaseParams, choose, entries, parse, read_section
-from pipeline.engine.command import run_stage
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.verdicts import PLAIN
-from pipeline.files import write_json
-from pipeline.optimal.bounds import bounds_path, stored_bounds
-from pipeline.optimal.model_bounds import model_bounds
-from pipeline.report.page import write_report
-from pipeline.stages.paths import ARTIFACTS, TIMING, WORK, receipt_file
+from loopwright.pipeline.cases import all_cases, beside
+from loopwright.pipeline.config.params import CaseParams, choose, entries, parse, read_section
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.verdicts import PLAIN
+from loopwright.pipeline.files import write_json
+from loopwright.pipeline.optimal.bounds import bounds_path, stored_bounds
+from loopwright.pipeline.optimal.model_bounds import model_bounds
+from loopwright.pipeline.report.page import write_report
+from loopwright.pipeline.stages.paths import ARTIFACTS, TIMING, WORK, receipt_file
 
 
 def report(name: str) -> None:

@@ -6,17 +6,17 @@ import shutil
 import sys
 from dataclasses import replace
 
-from pipeline.config.exports import SCREENED, ExportParams, screened_record
-from pipeline.config.plants import PlantParams
-from pipeline.engine.command import run_stage
-from pipeline.errors import RecordError
-from pipeline.files import write_json
-from pipeline.historian.agreement import as_stated, check_agreement, check_period, limits_of, within_stated
-from pipeline.historian.excerpt import evenly
-from pipeline.historian.exported import screened_export, signal_tags, with_units
-from pipeline.historian.loop_rows import set_points
-from pipeline.historian.refusal import refusal
-from pipeline.report.screening import write_page
+from loopwright.pipeline.config.exports import SCREENED, ExportParams, screened_record
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.files import write_json
+from loopwright.pipeline.historian.agreement import as_stated, check_agreement, check_period, limits_of, within_stated
+from loopwright.pipeline.historian.excerpt import evenly
+from loopwright.pipeline.historian.exported import screened_export, signal_tags, with_units
+from loopwright.pipeline.historian.loop_rows import set_points
+from loopwright.pipeline.historian.refusal import refusal
+from loopwright.pipeline.report.screening import write_page
 
 
 def screen(name: str) -> None:

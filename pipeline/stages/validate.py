@@ -12,25 +12,33 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from pipeline.cases import all_cases
-from pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section, sections
-from pipeline.engine.command import run_stage
-from pipeline.errors import LawError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.dead_time import dead_times
-from pipeline.evaluation.evidence import WITHHELD, Evidence
-from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.law_evidence import BASE, Analysis, Form, LawEvidence, LawMetrics, OverSeeds, lock_up_text
-from pipeline.evaluation.model_evidence import identified_part
-from pipeline.evaluation.open_loop import errors_at_rest
-from pipeline.evaluation.poor_laws import why_poor
-from pipeline.evaluation.reached import grounds_of, widest
-from pipeline.evaluation.replay import replay
-from pipeline.evaluation.trial import Metrics, Trial, step_us
-from pipeline.evaluation.trials import try_files
-from pipeline.export.controller_file import with_evidence, withhold
-from pipeline.files import read_json, write_json
-from pipeline.stages.paths import (
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section, sections
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.dead_time import dead_times
+from loopwright.pipeline.evaluation.evidence import WITHHELD, Evidence
+from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.law_evidence import (
+    BASE,
+    Analysis,
+    Form,
+    LawEvidence,
+    LawMetrics,
+    OverSeeds,
+    lock_up_text,
+)
+from loopwright.pipeline.evaluation.model_evidence import identified_part
+from loopwright.pipeline.evaluation.open_loop import errors_at_rest
+from loopwright.pipeline.evaluation.poor_laws import why_poor
+from loopwright.pipeline.evaluation.reached import grounds_of, widest
+from loopwright.pipeline.evaluation.replay import replay
+from loopwright.pipeline.evaluation.trial import Metrics, Trial, step_us
+from loopwright.pipeline.evaluation.trials import try_files
+from loopwright.pipeline.export.controller_file import with_evidence, withhold
+from loopwright.pipeline.files import read_json, write_json
+from loopwright.pipeline.stages.paths import (
     ARTIFACTS,
     analysis_file,
     controller_file,
@@ -40,7 +48,7 @@ from pipeline.stages.paths import (
     step_time_file,
     validation_folder,
 )
-from serving.controller import Controller
+from loopwright.serving.controller import Controller
 
 NOTHING = "so nothing is shipped"
 REMEDY = "give the law other numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"

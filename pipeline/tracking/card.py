@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from html import escape
 
-from pipeline.evaluation.law_evidence import Analysis
-from pipeline.evaluation.metric import ratio_to_bound, with_unit
-from pipeline.evaluation.standing import because
-from pipeline.evaluation.validation import Validation
-from pipeline.simulation.scenario import NOISE_SUFFIX
-from pipeline.tracking.gate import Gate, Rank
+from loopwright.pipeline.evaluation.law_evidence import Analysis
+from loopwright.pipeline.evaluation.metric import ratio_to_bound, with_unit
+from loopwright.pipeline.evaluation.standing import because
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.tracking.gate import Gate, Rank
 
 GAP = "&nbsp;" * 4
 """Cells have no padding there and may not be styled."""

@@ -32,8 +32,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from pipeline.evaluation.law_evidence import lock_up_text
-from pipeline.evaluation.validation import GateResult, Validation
+from loopwright.pipeline.evaluation.law_evidence import lock_up_text
+from loopwright.pipeline.evaluation.validation import GateResult, Validation
 
 
 @dataclass(frozen=True, slots=True)

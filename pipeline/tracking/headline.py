@@ -11,11 +11,11 @@ import statistics
 from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
 
-from pipeline.evaluation.law_evidence import BASE, LawMetrics
-from pipeline.evaluation.validation import Validation
-from pipeline.simulation.scenario import NOISE_SUFFIX
-from pipeline.tracking.gate import Gate
-from pipeline.tracking.stage_results import flat
+from loopwright.pipeline.evaluation.law_evidence import BASE, LawMetrics
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.tracking.gate import Gate
+from loopwright.pipeline.tracking.stage_results import flat
 
 MOST = 12
 OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")

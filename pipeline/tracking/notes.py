@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pipeline.evaluation.validation import Validation
-from pipeline.tracking.gate import Gate
-from pipeline.tracking.headline import ratio_name
-from pipeline.tracking.stage_results import StageResult, Times
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.tracking.gate import Gate
+from loopwright.pipeline.tracking.headline import ratio_name
+from loopwright.pipeline.tracking.stage_results import StageResult, Times
 
 WHAT = {
     "screen": "Read and screened the export files of the plant *{case}*, and made its record of them."

@@ -10,15 +10,15 @@ from typing import Any
 
 from mlflow import MlflowClient
 
-from pipeline.evaluation.standing import withheld_in
-from pipeline.evaluation.validation import FILE, Validation
-from pipeline.files import sha256
-from pipeline.tracking.notes import experiment_note
-from pipeline.tracking.registry import describe, elect_champion, register, withdraw
-from pipeline.tracking.runs import describe_experiment, git_commit, published, refresh, write_run
-from pipeline.tracking.signing import Signer
-from pipeline.tracking.stage_results import StageResult, dataset_hash, datasets, read_lock
-from pipeline.tracking.store import experiment_id, hide_default, store
+from loopwright.pipeline.evaluation.standing import withheld_in
+from loopwright.pipeline.evaluation.validation import FILE, Validation
+from loopwright.pipeline.files import sha256
+from loopwright.pipeline.tracking.notes import experiment_note
+from loopwright.pipeline.tracking.registry import describe, elect_champion, register, withdraw
+from loopwright.pipeline.tracking.runs import describe_experiment, git_commit, published, refresh, write_run
+from loopwright.pipeline.tracking.signing import Signer
+from loopwright.pipeline.tracking.stage_results import StageResult, dataset_hash, datasets, read_lock
+from loopwright.pipeline.tracking.store import experiment_id, hide_default, store
 
 
 def publish(root: Path) -> dict[str, Any]:
@@ -29,7 +29,7 @@ def publish(root: Path) -> dict[str, Any]:
     not those of dvc.lock (a stage that was killed, a case that never ran here) is left out; one line
     counts these by case.
 
-    Where the environment names a key (see ``pipeline.tracking.signing``), it signs the controllers.
+    Where the environment names a key (see ``loopwright.pipeline.tracking.signing``), it signs the controllers.
 
     Raises TrackingError where there is no dvc.lock or the store does not answer, SignatureError where the key cannot
     be used.

@@ -21,16 +21,16 @@ from mlflow.exceptions import MlflowException
 from mlflow.models import ModelSignature
 from mlflow.types import Schema, TensorSpec
 
-from pipeline.errors import TrackingError
-from pipeline.evaluation.validation import Validation
-from pipeline.files import sha256, write_bytes
-from pipeline.tracking import card, signing
-from pipeline.tracking.gate import Gate
-from pipeline.tracking.signing import Signer
-from pipeline.tracking.store import missing_file
-from serving.errors import ArtifactError, SignatureError
-from serving.sidecar import manifest_in, require_sidecar
-from serving.words import harmless, plain
+from loopwright.pipeline.errors import TrackingError
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.files import sha256, write_bytes
+from loopwright.pipeline.tracking import card, signing
+from loopwright.pipeline.tracking.gate import Gate
+from loopwright.pipeline.tracking.signing import Signer
+from loopwright.pipeline.tracking.store import missing_file
+from loopwright.serving.errors import ArtifactError, SignatureError
+from loopwright.serving.sidecar import manifest_in, require_sidecar
+from loopwright.serving.words import harmless, plain
 
 CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"
 BY_HAND = "champion_by"
@@ -315,7 +315,7 @@ def _signer(version: ModelVersion, file: Path, trusted: Sequence[Path] | None) -
     said = signing.words(version.tags)
     if trusted is None:
         return f"signed by {said}, as the store says: verify it with --key PUBLIC" if said else "not signed"
-    from serving.signing.verify import verified
+    from loopwright.serving.signing.verify import verified
 
     try:
         return f"signed by {verified(file, trusted).words}: verified"

@@ -13,10 +13,10 @@ from mlflow import MlflowClient
 from mlflow.entities import Dataset, DatasetInput, InputTag, Metric, Param, Run
 from mlflow.utils.time import get_current_time_millis
 
-from pipeline.evaluation.validation import Validation
-from pipeline.tracking.headline import curves, headline, of_gate, table
-from pipeline.tracking.notes import run_note
-from pipeline.tracking.stage_results import StageResult, Times
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.tracking.headline import curves, headline, of_gate, table
+from loopwright.pipeline.tracking.notes import run_note
+from loopwright.pipeline.tracking.stage_results import StageResult, Times
 
 KEY_TAG = "stage_key"
 ARTIFACTS = {".png", ".json", ".html", ".md", ".onnx"}

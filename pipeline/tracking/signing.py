@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING
 
 from mlflow import MlflowClient
 
-from pipeline.errors import TrackingError
-from serving.signing.command import password_of
+from loopwright.pipeline.errors import TrackingError
+from loopwright.serving.signing.command import password_of
 
 if TYPE_CHECKING:
-    from serving.signing.keys import PrivateKey
+    from loopwright.serving.signing.keys import PrivateKey
 
 KEY = "LOOPWRIGHT_SIGNING_KEY"
 PASSWORD, PASSWORD_FILE = "LOOPWRIGHT_SIGNING_PASSWORD", "LOOPWRIGHT_SIGNING_PASSWORD_FILE"
@@ -47,7 +47,7 @@ class Signer:
         place = environment.get(KEY)
         if not place:
             return None
-        from serving.signing.keys import PrivateKey  # here: it needs the package cryptography
+        from loopwright.serving.signing.keys import PrivateKey  # here: it needs the package cryptography
 
         days = environment.get(DAYS, "")
         if days and not (days.isdecimal() and 1 <= int(days) <= _LONGEST):
@@ -63,7 +63,7 @@ class Signer:
         """
         if self._holds(known):
             return present(known)
-        from serving.signing.sign import sign
+        from loopwright.serving.signing.sign import sign
 
         now = datetime.now(UTC).replace(microsecond=0)
         expires = None if self.lasting is None else now + self.lasting

@@ -1,7 +1,7 @@
 """The results of the pipeline's stages: what dvc.lock says of each, what identifies it, and when it came about.
 
 Outputs hold no time, so that an equal result is an equal file. When a stage ran, and for how long, stands in
-its receipt, which ``pipeline.engine.start`` writes.
+its receipt, which ``loopwright.pipeline.engine.start`` writes.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Any
 
 import yaml
 
-from pipeline.engine.start import receipt_path
-from pipeline.errors import TrackingError
-from pipeline.files import digest
+from loopwright.pipeline.engine.start import receipt_path
+from loopwright.pipeline.errors import TrackingError
+from loopwright.pipeline.files import digest
 
 SLACK_S = 60.0
 """DVC may copy the outputs into its cache and back before its next stage starts."""

@@ -18,7 +18,7 @@ from mlflow.exceptions import MlflowException
 from mlflow.store.db import utils as database
 from sqlalchemy.exc import SQLAlchemyError
 
-from pipeline.errors import TrackingError
+from loopwright.pipeline.errors import TrackingError
 
 LOCAL = "mlflow.db"
 FILES = "mlruns"

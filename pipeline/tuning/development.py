@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.errors import PlantError
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.noise import coloured
-from pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.noise import coloured
+from loopwright.pipeline.plants.simulator import Array, Simulator
 
 LawStep = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 """A control law or its ``forward``: (sp, pv, dv, mv_applied, state) -> (mv, state_next, info)."""

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.engine.progress import steps
-from pipeline.errors import LawError
-from pipeline.plants.simulator import Array
-from pipeline.tuning.responses import FirstOrder
-from pipeline.tuning.rules import PidSettings
+from loopwright.pipeline.engine.progress import steps
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.tuning.responses import FirstOrder
+from loopwright.pipeline.tuning.rules import PidSettings
 
 Loops = tuple[PidSettings, ...]
 """Settings of each loop."""

@@ -8,9 +8,9 @@ from itertools import permutations
 
 import numpy as np
 
-from pipeline.errors import LawError
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 Pairs = tuple[tuple[int, int], ...]
 """(CV, MV) of each loop, in the order of the MVs."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite, sqrt
 
-from pipeline.tuning.rules import PidSettings
-from serving.manifest import Signal
+from loopwright.pipeline.tuning.rules import PidSettings
+from loopwright.serving.manifest import Signal
 
 PERCENT = 100.0  # whole range of an MV in %
 

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.errors import PlantError
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.tuning.development import BatchLoops, LawStep
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.tuning.development import BatchLoops, LawStep
 
 CHECK = 25  # samples between two looks at who has arrived
 

@@ -10,9 +10,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.errors import LawError, PlantError
-from pipeline.plants.linearization import Linearization
-from pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.errors import LawError, PlantError
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.simulator import Array, Simulator
 
 RANK = 1e-8  # singular values of the Hankel matrix below this share of the largest are rounding
 NOTHING = 1e-14  # a largest one below this share of |C| |B| is nothing at all

@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import LawError
-from pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.plants.simulator import Array, Simulator
 
 STEP = 0.01  # of an MV's range
 SHORTEST, LONGEST = 100, 3200  # samples of a response

@@ -9,10 +9,10 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import LawError
-from pipeline.plants.linearization import Linearization
-from pipeline.plants.simulator import Array
-from pipeline.tuning.reduction import LagWithDeadTime, minimal
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.tuning.reduction import LagWithDeadTime, minimal
 
 LONGEST_FILTER = 40.0  # periods; an IMC filter is looked for between half a period and this
 

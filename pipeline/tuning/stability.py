@@ -13,10 +13,10 @@ import torch
 from scipy import linalg
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from pipeline.tuning.development import LawStep
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.tuning.development import LawStep
 
 SETTLING = 50  # steps at rest until a law's state no longer changes
 BISECTIONS = 9  # of the contraction rate: to within 0.2 % of the way to 1

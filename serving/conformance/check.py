@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from serving.conformance.kit import KIT, VECTORS
-from serving.conformance.numbers import Array, read, read_all
-from serving.errors import ContractError, LoopwrightError
-from serving.words import plain
+from loopwright.serving.conformance.kit import KIT, VECTORS
+from loopwright.serving.conformance.numbers import Array, read, read_all
+from loopwright.serving.errors import ContractError, LoopwrightError
+from loopwright.serving.words import plain
 
 OUTPUTS = ("mv", "state_next", "info")
 READS = (1, 2, KIT)  # versions of the kit

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from serving.conformance.numbers import written
-from serving.conformance.scans import Scanned, scanned, start
-from serving.conformance.steps import Answer, answered
-from serving.controller import Controller, runtime_version
-from serving.errors import LoopwrightError
-from serving.guard import READ_BACK_MARGIN, InRange, Sample
-from serving.sidecar import sidecar
+from loopwright.serving.conformance.numbers import written
+from loopwright.serving.conformance.scans import Scanned, scanned, start
+from loopwright.serving.conformance.steps import Answer, answered
+from loopwright.serving.controller import Controller, runtime_version
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.guard import READ_BACK_MARGIN, InRange, Sample
+from loopwright.serving.sidecar import sidecar
 
 # Version of the format. 1 began its scans at an MV that was told, so it shows nothing of a start without one; up to 2
 # every command arrived, so it shows nothing of what follows one that did not.

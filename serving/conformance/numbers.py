@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.errors import ContractError
+from loopwright.serving.errors import ContractError
 
 Array: TypeAlias = NDArray[np.float64]
 

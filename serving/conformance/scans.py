@@ -10,10 +10,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.controller import Controller
-from serving.guard import READ_BACK_MARGIN, InRange, Sample
-from serving.loop import Command, ControlLoop, Mode
-from serving.manifest import Manifest, Signal
+from loopwright.serving.controller import Controller
+from loopwright.serving.guard import READ_BACK_MARGIN, InRange, Sample
+from loopwright.serving.loop import Command, ControlLoop, Mode
+from loopwright.serving.manifest import Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.controller import Controller, Step
-from serving.errors import OutputError, SampleError
-from serving.manifest import SENSITIVE, Manifest, Signal
+from loopwright.serving.controller import Controller, Step
+from loopwright.serving.errors import OutputError, SampleError
+from loopwright.serving.manifest import SENSITIVE, Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from serving.manifest import Manifest
+from loopwright.serving.manifest import Manifest
 
 Kind: TypeAlias = Literal["change", "swap", "fault", "connection", "monitor", "acknowledged"]
 

@@ -7,8 +7,8 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from serving.errors import LoopError
-from serving.file_lock import LockTakenError, locked
+from loopwright.serving.errors import LoopError
+from loopwright.serving.file_lock import LockTakenError, locked
 
 SCHEMA = 2
 TABLES = """

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.journal.entries import Scan
+from loopwright.serving.journal.entries import Scan
 
 Array: TypeAlias = NDArray[np.float64]
 

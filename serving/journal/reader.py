@@ -14,9 +14,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.journal.entries import Event, Scan
-from serving.journal.file import opened
-from serving.journal.packing import table, unpacked
+from loopwright.serving.journal.entries import Event, Scan
+from loopwright.serving.journal.file import opened
+from loopwright.serving.journal.packing import table, unpacked
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from enum import Enum
 from pathlib import Path
 from typing import TypeAlias
 
-from serving.journal.entries import Event
-from serving.journal.file import held, is_damage
+from loopwright.serving.journal.entries import Event
+from loopwright.serving.journal.file import held, is_damage
 
 Identity: TypeAlias = tuple[int, int] | None  # device, inode; None: not there
 

@@ -18,15 +18,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from serving.errors import LoopError
-from serving.journal.entries import Event, Scan, columns
-from serving.journal.file import held, holds, is_damage, opened, sole_writer
-from serving.journal.packing import packed
-from serving.journal.recovery import Harm, OpenFiles, alarm, cleared, copied, made_again
-from serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
-from serving.journal.waiting import Item, Waiting
-from serving.manifest import Manifest
-from serving.words import named
+from loopwright.serving.errors import LoopError
+from loopwright.serving.journal.entries import Event, Scan, columns
+from loopwright.serving.journal.file import held, holds, is_damage, opened, sole_writer
+from loopwright.serving.journal.packing import packed
+from loopwright.serving.journal.recovery import Harm, OpenFiles, alarm, cleared, copied, made_again
+from loopwright.serving.journal.rotation import SLACK, most_events, shorten_events, shorten_scans
+from loopwright.serving.journal.waiting import Item, Waiting
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.words import named
 
 FLUSH_S = 0.25  # so much is lost at most when the process dies
 BLOCK = 600  # scans that are packed together

@@ -7,13 +7,13 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.manifest import Manifest
-from serving.monitor.answers import Answers
-from serving.monitor.beside import ranges
-from serving.monitor.chart import Chart
-from serving.monitor.estimates import estimated
-from serving.monitor.memory import ANY, COUNT, Kept, Remembers
-from serving.monitor.pace import WEEK_S
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.monitor.answers import Answers
+from loopwright.serving.monitor.beside import ranges
+from loopwright.serving.monitor.chart import Chart
+from loopwright.serving.monitor.estimates import estimated
+from loopwright.serving.monitor.memory import ANY, COUNT, Kept, Remembers
+from loopwright.serving.monitor.pace import WEEK_S
 
 Array: TypeAlias = NDArray[np.float64]
 

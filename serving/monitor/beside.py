@@ -8,8 +8,8 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.manifest import Manifest, Signal
-from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
+from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.monitor.memory import ANY, COUNT, POSITIVE, SIZE, TIME_S, Kept, Remembers
+from loopwright.serving.monitor.memory import ANY, COUNT, POSITIVE, SIZE, TIME_S, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 

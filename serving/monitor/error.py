@@ -7,7 +7,7 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.monitor.memory import COUNT, SIGN, SIZE, Kept, Remembers
+from loopwright.serving.monitor.memory import COUNT, SIGN, SIZE, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.monitor.chart import Chart
-from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
-from serving.monitor.squares import LEAST_SIGMA, log_mean_square
+from loopwright.serving.monitor.chart import Chart
+from loopwright.serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
+from loopwright.serving.monitor.squares import LEAST_SIGMA, log_mean_square
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.guard import READ_BACK_MARGIN
-from serving.manifest import Signal
-from serving.monitor.plight import AT_END, FAR
-from serving.standing import SAME, SETTLED
+from loopwright.serving.guard import READ_BACK_MARGIN
+from loopwright.serving.manifest import Signal
+from loopwright.serving.monitor.plight import AT_END, FAR
+from loopwright.serving.standing import SAME, SETTLED
 
 Array: TypeAlias = NDArray[np.float64]
 

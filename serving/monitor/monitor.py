@@ -10,25 +10,25 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.guard import Sample
-from serving.loop import Command, Mode
-from serving.manifest import Manifest
-from serving.monitor.answers import Answers
-from serving.monitor.batches import Batches
-from serving.monitor.chart import Chart
-from serving.monitor.error import Swing, harris_index
-from serving.monitor.estimates import Estimates
-from serving.monitor.following import Following
-from serving.monitor.memory import TIME_S, number
-from serving.monitor.numbers import numbers
-from serving.monitor.pace import DAY_S, WEEK_S, blocks, dead_times, pooled, settle_scans
-from serving.monitor.plight import AT_END, Plight
-from serving.monitor.residual import Foresight
-from serving.monitor.rest import RestMap
-from serving.monitor.shares import Share
-from serving.monitor.squares import log_mean_square
-from serving.monitor.verdict import Verdict, failed
-from serving.monitor.verdicts import verdicts
+from loopwright.serving.guard import Sample
+from loopwright.serving.loop import Command, Mode
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.monitor.answers import Answers
+from loopwright.serving.monitor.batches import Batches
+from loopwright.serving.monitor.chart import Chart
+from loopwright.serving.monitor.error import Swing, harris_index
+from loopwright.serving.monitor.estimates import Estimates
+from loopwright.serving.monitor.following import Following
+from loopwright.serving.monitor.memory import TIME_S, number
+from loopwright.serving.monitor.numbers import numbers
+from loopwright.serving.monitor.pace import DAY_S, WEEK_S, blocks, dead_times, pooled, settle_scans
+from loopwright.serving.monitor.plight import AT_END, Plight
+from loopwright.serving.monitor.residual import Foresight
+from loopwright.serving.monitor.rest import RestMap
+from loopwright.serving.monitor.shares import Share
+from loopwright.serving.monitor.squares import log_mean_square
+from loopwright.serving.monitor.verdict import Verdict, failed
+from loopwright.serving.monitor.verdicts import verdicts
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class Monitor:
 
     ``observe`` takes a scan: bounded work and memory, and no content of it raises. The settling time of the validation
     (the evidence's ``settling``, else ``SETTLE`` scans) says how long a period of rest is. It learns the normal from
-    the first periods in AUTO; ``serving.monitor.verdicts`` says what each figure is held against.
+    the first periods in AUTO; ``loopwright.serving.monitor.verdicts`` says what each figure is held against.
 
     Parameters
     ----------

@@ -5,10 +5,10 @@ from __future__ import annotations
 from math import inf, isfinite
 from typing import TYPE_CHECKING
 
-from serving.monitor.residual import Foresight
+from loopwright.serving.monitor.residual import Foresight
 
 if TYPE_CHECKING:
-    from serving.monitor.monitor import Monitor
+    from loopwright.serving.monitor.monitor import Monitor
 
 
 def numbers(m: Monitor) -> dict[str, float]:

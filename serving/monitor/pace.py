@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import ceil
 
-from serving.manifest import Manifest
+from loopwright.serving.manifest import Manifest
 
 SETTLE, LEAST_SETTLE, MOST_SETTLE = 100, 20, 2000  # scans
 DEAD, MOST_DEAD = 2, 200  # scans

@@ -7,11 +7,11 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.manifest import Manifest
-from serving.monitor.beside import ranges
-from serving.monitor.chart import Chart
-from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
-from serving.monitor.squares import LEAST_SIGMA, log_mean_square, rms_ratio
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.monitor.beside import ranges
+from loopwright.serving.monitor.chart import Chart
+from loopwright.serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
+from loopwright.serving.monitor.squares import LEAST_SIGMA, log_mean_square, rms_ratio
 
 Array: TypeAlias = NDArray[np.float64]
 

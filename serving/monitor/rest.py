@@ -8,9 +8,9 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.manifest import Signal
-from serving.monitor.chart import Chart
-from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
+from loopwright.serving.manifest import Signal
+from loopwright.serving.monitor.chart import Chart
+from loopwright.serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
+from loopwright.serving.monitor.memory import ANY, COUNT, SIZE, Kept, Remembers
 
 
 class Share(Remembers):

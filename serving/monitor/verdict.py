@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from serving.manifest import Signal
+from loopwright.serving.manifest import Signal
 
 Level: TypeAlias = Literal["as validated", "watch", "retrain", "not known yet"]
 

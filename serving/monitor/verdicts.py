@@ -16,20 +16,21 @@
 | answer of a PV | what the errors of a linear model went with while it learnt (chart) |
 | a variable over a batch | its means over the eighths of the first batches (chart) |
 
-A chart is a CUSUM whose limit follows from the false alarms a week that are allowed: see ``serving.monitor.chart``.
+A chart is a CUSUM whose limit follows from the false alarms a week that are allowed: see
+``loopwright.serving.monitor.chart``.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from serving.monitor.batches import PARTS
-from serving.monitor.residual import Foresight
-from serving.monitor.squares import rms_ratio
-from serving.monitor.verdict import Level, Verdict, failed, unit_of, unknown, when
+from loopwright.serving.monitor.batches import PARTS
+from loopwright.serving.monitor.residual import Foresight
+from loopwright.serving.monitor.squares import rms_ratio
+from loopwright.serving.monitor.verdict import Level, Verdict, failed, unit_of, unknown, when
 
 if TYPE_CHECKING:
-    from serving.monitor.monitor import Monitor
+    from loopwright.serving.monitor.monitor import Monitor
 
 MOST_HOLD = 0.02
 LEAST_SHARE, LEAST_OUTSIDE = 0.2, 0.1

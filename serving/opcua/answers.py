@@ -8,9 +8,9 @@ from typing import TypeVar
 
 from asyncua import ua
 
-from serving.errors import EndpointError
-from serving.opcua.values import words
-from serving.words import named
+from loopwright.serving.errors import EndpointError
+from loopwright.serving.opcua.values import words
+from loopwright.serving.words import named
 
 T = TypeVar("T")
 

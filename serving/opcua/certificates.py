@@ -18,8 +18,8 @@ from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.hazmat.primitives.serialization import load_der_private_key, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from serving.errors import LoopError
-from serving.opcua.settings import Server
+from loopwright.serving.errors import LoopError
+from loopwright.serving.opcua.settings import Server
 
 APPLICATION = "urn:loopwright:client"
 PEM = b"-----BEGIN"

@@ -14,20 +14,20 @@ import numpy as np
 from asyncua import ua
 from numpy.typing import NDArray
 
-from serving.errors import EndpointError, LoopError
-from serving.guard import Sample
-from serving.manifest import Manifest
-from serving.opcua.ages import Ages
-from serving.opcua.answers import LateError
-from serving.opcua.heartbeat import Heartbeat
-from serving.opcua.lease import LeaseRefusedError, NodeLease
-from serving.opcua.link import Link
-from serving.opcua.nameplates import Identity, Nameplates, identity, whole
-from serving.opcua.plan import Plan
-from serving.opcua.sampling import Sampling, Values
-from serving.opcua.settings import Nodes, Server
-from serving.opcua.values import GOOD, Reading, words
-from serving.words import first_line, named
+from loopwright.serving.errors import EndpointError, LoopError
+from loopwright.serving.guard import Sample
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.opcua.ages import Ages
+from loopwright.serving.opcua.answers import LateError
+from loopwright.serving.opcua.heartbeat import Heartbeat
+from loopwright.serving.opcua.lease import LeaseRefusedError, NodeLease
+from loopwright.serving.opcua.link import Link
+from loopwright.serving.opcua.nameplates import Identity, Nameplates, identity, whole
+from loopwright.serving.opcua.plan import Plan
+from loopwright.serving.opcua.sampling import Sampling, Values
+from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.opcua.values import GOOD, Reading, words
+from loopwright.serving.words import first_line, named
 
 __all__ = ["OpcUaEndpoint", "Values"]
 
@@ -52,14 +52,14 @@ class OpcUaEndpoint:
     ``write`` passes the MV on and returns; whether the plant took it is known at the next scan. An answer that is late
     is a fault and never waited for. After ``SILENT_SCANS`` without one the connection is broken off, and made anew with
     growing pauses; ids are resolved anew then. Nodes that are others now than when the loop began, or of another type,
-    unit or range, are a fault, see ``serving.opcua.nameplates``.
+    unit or range, are a fault, see ``loopwright.serving.opcua.nameplates``.
 
     Parameters
     ----------
     manifest
         The controller's: its signals say which nodes are needed.
     server, nodes
-        See ``serving.opcua.settings``.
+        See ``loopwright.serving.opcua.settings``.
     max_age_s
         Age [s] from which on values are none; ``read`` then says what became of the connection.
     speed

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from serving.errors import EndpointError
-from serving.opcua.link import Link
-from serving.opcua.plan import Plan
-from serving.opcua.values import GOOD, variant, words
-from serving.words import first_line
+from loopwright.serving.errors import EndpointError
+from loopwright.serving.opcua.link import Link
+from loopwright.serving.opcua.plan import Plan
+from loopwright.serving.opcua.values import GOOD, variant, words
+from loopwright.serving.words import first_line
 
 
 class Heartbeat:

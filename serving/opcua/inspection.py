@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 from asyncua import ua
 
-from serving.errors import EndpointError
-from serving.guard import InRange, Sample, implausible
-from serving.manifest import Manifest, Signal
-from serving.opcua.certificates import last_day, valid_until
-from serving.opcua.lease import NAME, WRITABLE, SeveralLeasesError, beside
-from serving.opcua.link import Link
-from serving.opcua.nameplates import (
+from loopwright.serving.errors import EndpointError
+from loopwright.serving.guard import InRange, Sample, implausible
+from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.opcua.certificates import last_day, valid_until
+from loopwright.serving.opcua.lease import NAME, WRITABLE, SeveralLeasesError, beside
+from loopwright.serving.opcua.link import Link
+from loopwright.serving.opcua.nameplates import (
     Identity,
     Plate,
     by_name,
@@ -30,11 +30,11 @@ from serving.opcua.nameplates import (
     uri_of,
     whole,
 )
-from serving.opcua.plan import Plan, Role, Row, shared_node
-from serving.opcua.sampling import NO_NUMBERS
-from serving.opcua.settings import NO_LEASE, Nodes, Point, Server
-from serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, exact, words
-from serving.words import first_line
+from loopwright.serving.opcua.plan import Plan, Role, Row, shared_node
+from loopwright.serving.opcua.sampling import NO_NUMBERS
+from loopwright.serving.opcua.settings import NO_LEASE, Nodes, Point, Server
+from loopwright.serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, exact, words
+from loopwright.serving.words import first_line
 
 NO_LEASE_NOTE = (
     "there is none, so a loop on another machine that writes the same MVs is not found: have the server hold a text "

@@ -11,10 +11,10 @@ from contextlib import suppress
 
 from asyncua import ua
 
-from serving.errors import EndpointError, LoopError
-from serving.opcua.answers import unanswered
-from serving.opcua.link import Link
-from serving.opcua.values import GOOD, words
+from loopwright.serving.errors import EndpointError, LoopError
+from loopwright.serving.opcua.answers import unanswered
+from loopwright.serving.opcua.link import Link
+from loopwright.serving.opcua.values import GOOD, words
 
 NAME = "LoopwrightLease"  # of a node beside those of the MVs: it is the lease of every loop that is told of none
 WRITABLE = 2  # the second bit of an access level

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from asyncua import ua
 
-from serving.errors import EndpointError
+from loopwright.serving.errors import EndpointError
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -11,13 +11,13 @@ import numpy as np
 from asyncua import ua
 from numpy.typing import NDArray
 
-from serving.errors import EndpointError, LoopError
-from serving.manifest import Manifest, Signal
-from serving.opcua.lease import SeveralLeasesError, beside
-from serving.opcua.link import Link
-from serving.opcua.settings import NO_LEASE, Nodes, Point
-from serving.opcua.values import exact, variant
-from serving.words import first_line
+from loopwright.serving.errors import EndpointError, LoopError
+from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.opcua.lease import SeveralLeasesError, beside
+from loopwright.serving.opcua.link import Link
+from loopwright.serving.opcua.settings import NO_LEASE, Nodes, Point
+from loopwright.serving.opcua.values import exact, variant
+from loopwright.serving.words import first_line
 
 Array: TypeAlias = NDArray[np.float64]
 

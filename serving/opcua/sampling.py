@@ -9,13 +9,13 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.fault import Fault
-from serving.manifest import Manifest
-from serving.opcua.ages import Ages
-from serving.opcua.nameplates import Nameplates
-from serving.opcua.plan import Plan, Role, Row
-from serving.opcua.settings import Nodes, Server
-from serving.opcua.values import BAD, GOOD, UNCERTAIN, Reading
+from loopwright.serving.fault import Fault
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.opcua.ages import Ages
+from loopwright.serving.opcua.nameplates import Nameplates
+from loopwright.serving.opcua.plan import Plan, Role, Row
+from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.opcua.values import BAD, GOOD, UNCERTAIN, Reading
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from math import isfinite
 from pathlib import Path
 from typing import Literal
 
-from serving.errors import LoopError
-from serving.fields import nearest
-from serving.manifest import Manifest, Signal
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fields import nearest
+from loopwright.serving.manifest import Manifest, Signal
 
 NO_LEASE = "none"  # nodes.lease: none is looked for
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from asyncua import ua
 
-from serving.errors import EndpointError
+from loopwright.serving.errors import EndpointError
 
 INTEGERS = {
     t: (low, high)

@@ -1,4 +1,4 @@
-"""The page's process: ``python -m serving.page``. It reads what it must know from standard input, and ends with it."""
+"""The page's process, ``python -m loopwright.serving.page``: standard input says what it must know, and ends it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import Any
 
 import uvicorn
 
-from serving.errors import LoopError
-from serving.page.address import listening
-from serving.page.app import PageApp
-from serving.page.patience import Impatient
-from serving.page.settings import Page
-from serving.station.control import asked
-from serving.words import first_line, named
+from loopwright.serving.errors import LoopError
+from loopwright.serving.page.address import listening
+from loopwright.serving.page.app import PageApp
+from loopwright.serving.page.patience import Impatient
+from loopwright.serving.page.settings import Page
+from loopwright.serving.station.control import asked
+from loopwright.serving.words import first_line, named
 
 NICE = 5  # the loop comes first
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import socket
 import ssl
 
-from serving.errors import LoopError
-from serving.page.settings import Page
-from serving.words import named
+from loopwright.serving.errors import LoopError
+from loopwright.serving.page.settings import Page
+from loopwright.serving.words import named
 
 
 def listening(page: Page) -> socket.socket:

@@ -20,14 +20,14 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from serving.errors import LoopError, LoopwrightError
-from serving.journal import JournalReader
-from serving.page import metrics
-from serving.page.access import LONGEST_BODY, Access
-from serving.page.candidates import candidates
-from serving.page.live import ENTRIES, LATER_MS, Ask, Live, shown
-from serving.page.shared import Shared
-from serving.page.trend import MOST_POINTS, trend
+from loopwright.serving.errors import LoopError, LoopwrightError
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.page import metrics
+from loopwright.serving.page.access import LONGEST_BODY, Access
+from loopwright.serving.page.candidates import candidates
+from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, shown
+from loopwright.serving.page.shared import Shared
+from loopwright.serving.page.trend import MOST_POINTS, trend
 
 STATIC = Path(__file__).parent / "static"
 BODY_S = 5.0  # in which the body of a change must be here

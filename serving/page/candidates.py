@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from serving.digest import file_digest, unseal
-from serving.errors import ArtifactError, LoopwrightError
-from serving.fitted import require_fits
-from serving.graph_audit import MAX_BYTES, audit
-from serving.manifest import MANIFEST_KEY, Manifest
+from loopwright.serving.digest import file_digest, unseal
+from loopwright.serving.errors import ArtifactError, LoopwrightError
+from loopwright.serving.fitted import require_fits
+from loopwright.serving.graph_audit import MAX_BYTES, audit
+from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 
 MOST = 50  # files that are looked at
 
@@ -43,7 +43,7 @@ def _described(path: Path, trusted: Sequence[str] | None) -> tuple[Manifest, str
     """Manifest, sha256 and signer, without a session; LoopwrightError where it is no controller, or not trusted."""
     signed = None
     if trusted is not None:
-        from serving.signing.verify import verified  # here: it needs the package cryptography
+        from loopwright.serving.signing.verify import verified  # here: it needs the package cryptography
 
         signed = verified(path, trusted)
     with path.open("rb") as file:

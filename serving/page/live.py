@@ -10,12 +10,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from serving.errors import LoopwrightError
-from serving.journal import JournalReader
-from serving.journal.reader import Entry
-from serving.page.shared import Shared
-from serving.page.trend import plain
-from serving.words import named
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.journal.reader import Entry
+from loopwright.serving.page.shared import Shared
+from loopwright.serving.page.trend import plain
+from loopwright.serving.words import named
 
 Ask: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-from serving.words import plain
+from loopwright.serving.words import plain
 
 MODES = ("SHADOW", "MANUAL", "AUTO", "HOLD")
 LEVELS = {"not known yet": -1, "as validated": 0, "watch": 1, "retrain": 2}

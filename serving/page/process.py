@@ -11,9 +11,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from serving.errors import LoopError
-from serving.own_process import module
-from serving.page.settings import Page
+from loopwright.serving.errors import LoopError
+from loopwright.serving.own_process import module
+from loopwright.serving.page.settings import Page
 
 START_S = 20.0
 FIRST_PAUSE_S, LAST_PAUSE_S = 1.0, 60.0
@@ -53,7 +53,7 @@ class PageProcess:
         self._thread.join(5)
 
     def _started(self) -> subprocess.Popen[str]:
-        command, environment = module("serving.page")
+        command, environment = module("loopwright.serving.page")
         process = subprocess.Popen(
             command,
             env=environment,

@@ -6,7 +6,7 @@ import ipaddress
 from dataclasses import dataclass
 from pathlib import Path
 
-from serving.errors import LoopError
+from loopwright.serving.errors import LoopError
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 

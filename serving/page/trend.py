@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.journal import JournalReader
+from loopwright.serving.journal import JournalReader
 
 Array: TypeAlias = NDArray[np.float64]
 Piece: TypeAlias = tuple[Array, dict[str, Array], list[str]]  # times, columns, modes

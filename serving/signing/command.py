@@ -7,9 +7,9 @@ import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from serving.errors import SignatureError
-from serving.signing.reading import contents
-from serving.words import plain
+from loopwright.serving.errors import SignatureError
+from loopwright.serving.signing.reading import contents
+from loopwright.serving.words import plain
 
 MAX_PASSWORD = 1023  # bytes, of cryptography
 MAX_FILE = 4096  # bytes, of a file with a password
@@ -24,7 +24,7 @@ def keygen_options(parser: argparse.ArgumentParser) -> None:
 
 def run_keygen(options: argparse.Namespace) -> None:
     """Make a private key and its public key."""
-    from serving.signing.keys import make_pair
+    from loopwright.serving.signing.keys import make_pair
 
     password = password_of(options.password_env, options.password_file)
     public, key = make_pair(options.key, options.kind, password)
@@ -46,8 +46,8 @@ def sign_options(parser: argparse.ArgumentParser) -> None:
 
 def run_sign(options: argparse.Namespace) -> None:
     """Write the signature of each file, beside it."""
-    from serving.signing.keys import PrivateKey
-    from serving.signing.sign import sign
+    from loopwright.serving.signing.keys import PrivateKey
+    from loopwright.serving.signing.sign import sign
 
     key = PrivateKey.read(options.key, password_of(options.password_env, options.password_file))
     expires = options.expires if options.days is None else datetime.now(UTC).replace(microsecond=0) + options.days
@@ -67,7 +67,7 @@ def verify_options(parser: argparse.ArgumentParser) -> None:
 
 def run_verify(options: argparse.Namespace) -> None:
     """Say who signed a file, or fail."""
-    from serving.signing.verify import verified
+    from loopwright.serving.signing.verify import verified
 
     found = verified(options.file, options.key, signature=options.signature)
     print(plain(f"{' and '.join(found.files)}: signed by {found.words}"))

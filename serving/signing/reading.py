@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from serving.errors import SignatureError
+from loopwright.serving.errors import SignatureError
 
 
 def contents(path: Path, most: int) -> bytes:

@@ -8,15 +8,15 @@ from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
 
-from serving import graph_audit
-from serving.digest import file_digest
-from serving.errors import ArtifactError, SignatureError
-from serving.sidecar import difference, manifest_in
-from serving.signing import bundle
-from serving.signing.keys import PrivateKey
-from serving.signing.reading import contents
-from serving.signing.statement import Statement, utc
-from serving.signing.verify import MAX_SIDECAR, signature_of
+from loopwright.serving import graph_audit
+from loopwright.serving.digest import file_digest
+from loopwright.serving.errors import ArtifactError, SignatureError
+from loopwright.serving.sidecar import difference, manifest_in
+from loopwright.serving.signing import bundle
+from loopwright.serving.signing.keys import PrivateKey
+from loopwright.serving.signing.reading import contents
+from loopwright.serving.signing.statement import Statement, utc
+from loopwright.serving.signing.verify import MAX_SIDECAR, signature_of
 
 
 def sign(

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from serving.errors import SignatureError
-from serving.signing.bundle import entry, json_object
+from loopwright.serving.errors import SignatureError
+from loopwright.serving.signing.bundle import entry, json_object
 
 STATEMENT = "https://in-toto.io/Statement/v1"
 PREDICATE = "https://model_signing/signature/v1.0"

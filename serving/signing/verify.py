@@ -9,13 +9,13 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from serving import graph_audit
-from serving.digest import file_digest
-from serving.errors import SignatureError
-from serving.signing import bundle
-from serving.signing.keys import PublicKey
-from serving.signing.reading import contents
-from serving.signing.statement import Statement
+from loopwright.serving import graph_audit
+from loopwright.serving.digest import file_digest
+from loopwright.serving.errors import SignatureError
+from loopwright.serving.signing import bundle
+from loopwright.serving.signing.keys import PublicKey
+from loopwright.serving.signing.reading import contents
+from loopwright.serving.signing.statement import Statement
 
 SUFFIX = ".sig"
 MAX_SIDECAR = 16 * 2**20

@@ -12,14 +12,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.controller import Controller
-from serving.errors import LoopError
-from serving.guard import implausible
-from serving.journal import Journal, JournalReader
-from serving.manifest import Signal
-from serving.opcua.nameplates import Seen
-from serving.opcua.sampling import Values
-from serving.station.lease import address_of
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopError
+from loopwright.serving.guard import implausible
+from loopwright.serving.journal import Journal, JournalReader
+from loopwright.serving.manifest import Signal
+from loopwright.serving.opcua.nameplates import Seen
+from loopwright.serving.opcua.sampling import Values
+from loopwright.serving.station.lease import address_of
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -18,21 +18,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.errors import EndpointError, LoopError
-from serving.first_steps import tried
-from serving.guard import Sample
-from serving.journal import JournalReader
-from serving.loop import Command, Mode
-from serving.manifest import Manifest, Signal
-from serving.proof import judged
-from serving.station.control import ask
-from serving.station.export import export, tag_table
-from serving.station.happened import happened, journal_of, lines, write_csv
-from serving.station.requests import TRIAL
-from serving.station.settings import Settings
-from serving.station.template import template
-from serving.trust import Controller, ending
-from serving.words import plain
+from loopwright.serving.errors import EndpointError, LoopError
+from loopwright.serving.first_steps import tried
+from loopwright.serving.guard import Sample
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.loop import Command, Mode
+from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.proof import judged
+from loopwright.serving.station.control import ask
+from loopwright.serving.station.export import export, tag_table
+from loopwright.serving.station.happened import happened, journal_of, lines, write_csv
+from loopwright.serving.station.requests import TRIAL
+from loopwright.serving.station.settings import Settings
+from loopwright.serving.station.template import template
+from loopwright.serving.trust import Controller, ending
+from loopwright.serving.words import plain
 
 SETTINGS = Path("loop.toml")
 JOURNAL_LOST = 3  # exit status of a loop whose journal lacks scans or events
@@ -153,7 +153,7 @@ def _init(options: argparse.Namespace) -> int:
     controller = Controller(options.file)
     if options.out.exists():
         raise LoopError(f"{options.out} is there already; name another file by --out, or remove it")
-    from serving.opcua.certificates import make
+    from loopwright.serving.opcua.certificates import make
 
     folder = options.out.absolute().parent
     try:
@@ -181,10 +181,10 @@ def _check(options: argparse.Namespace) -> int:
     _quiet()
     controller = tried(settings.controller, settings.sha256 or None, settings.trusted)
     manifest = controller.manifest
-    from serving.opcua.inspection import Found, inspected
-    from serving.opcua.nameplates import Seen, others_since
-    from serving.station.beginning import namespaces_before, nodes_before
-    from serving.station.rehearsal import rehearsed, require_free
+    from loopwright.serving.opcua.inspection import Found, inspected
+    from loopwright.serving.opcua.nameplates import Seen, others_since
+    from loopwright.serving.station.beginning import namespaces_before, nodes_before
+    from loopwright.serving.station.rehearsal import rehearsed, require_free
 
     here = rehearsed(settings, controller)
     for line in here.wrong:
@@ -244,7 +244,7 @@ def _run(options: argparse.Namespace) -> int:
         print(plain(f"would stop the loop: {line}"), file=sys.stderr)
     if misfits:
         return 2
-    from serving.station.station import Station
+    from loopwright.serving.station.station import Station
 
     def tell(line: str) -> None:
         print(plain(line), flush=True)
@@ -267,9 +267,9 @@ def _run(options: argparse.Namespace) -> int:
 
 def _misfits(settings: Settings, manifest: Manifest) -> list[str]:
     """Faults of ``loop check`` that are for good: another unit, a node that is not there. None while nobody answers."""
-    from serving.opcua.inspection import inspected
-    from serving.station.beginning import namespaces_before
-    from serving.station.rehearsal import require_free
+    from loopwright.serving.opcua.inspection import inspected
+    from loopwright.serving.station.beginning import namespaces_before
+    from loopwright.serving.station.rehearsal import require_free
 
     before = namespaces_before(settings.journal.file, settings.server.endpoint)
     with suppress(EndpointError):

@@ -13,10 +13,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from serving.errors import LoopError, LoopwrightError, NotProvenError
-from serving.first_steps import DEADLINE_S
-from serving.station.places import runtime_folder
-from serving.words import first_line, named, plain
+from loopwright.serving.errors import LoopError, LoopwrightError, NotProvenError
+from loopwright.serving.first_steps import DEADLINE_S
+from loopwright.serving.station.places import runtime_folder
+from loopwright.serving.words import first_line, named, plain
 
 Answer: TypeAlias = dict[str, Any]
 

@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from serving.errors import LoopError
-from serving.journal import JournalReader, Scan
+from loopwright.serving.errors import LoopError
+from loopwright.serving.journal import JournalReader, Scan
 
 WRITTEN = ("pv", "dv", "applied", "sp")  # groups of columns; the MV as the actuator has it from then on
 MEASURED = ("pv", "applied", "dv")  # in the order of a scan's statuses

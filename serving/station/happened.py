@@ -9,10 +9,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TextIO
 
-from serving.errors import LoopError
-from serving.journal import Event, JournalReader
-from serving.station.settings import Settings
-from serving.words import plain
+from loopwright.serving.errors import LoopError
+from loopwright.serving.journal import Event, JournalReader
+from loopwright.serving.station.settings import Settings
+from loopwright.serving.words import plain
 
 FIELDS = ("time", "kind", "who", "what", "reason")
 

@@ -12,10 +12,10 @@ from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from serving.errors import LoopError
-from serving.file_lock import LockTakenError, locked
-from serving.station.places import runtime_folder
-from serving.words import first_line
+from loopwright.serving.errors import LoopError
+from loopwright.serving.file_lock import LockTakenError, locked
+from loopwright.serving.station.places import runtime_folder
+from loopwright.serving.words import first_line
 
 OPC_UA_PORT, DISCARD_PORT = 4840, 9
 

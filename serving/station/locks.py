@@ -5,11 +5,11 @@ from __future__ import annotations
 import threading
 from contextlib import suppress
 
-from serving.errors import LoopError
-from serving.loop import ControlLoop, Mode
-from serving.opcua.nameplates import Identity
-from serving.station.lease import Lease
-from serving.station.recorder import Recorder
+from loopwright.serving.errors import LoopError
+from loopwright.serving.loop import ControlLoop, Mode
+from loopwright.serving.opcua.nameplates import Identity
+from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.recorder import Recorder
 
 ALARM = "lease"
 

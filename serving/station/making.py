@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from serving.clock import Clock
-from serving.controller import Controller
-from serving.endpoint import Endpoint
-from serving.loop import WARM_LEAD_S, ControlLoop, Mode
-from serving.proof import require_accepted
-from serving.station.settings import Settings
+from loopwright.serving.clock import Clock
+from loopwright.serving.controller import Controller
+from loopwright.serving.endpoint import Endpoint
+from loopwright.serving.loop import WARM_LEAD_S, ControlLoop, Mode
+from loopwright.serving.proof import require_accepted
+from loopwright.serving.station.settings import Settings
 
 
 def control_loop(

@@ -7,7 +7,7 @@ import stat
 import tempfile
 from pathlib import Path
 
-from serving.errors import LoopError
+from loopwright.serving.errors import LoopError
 
 
 def runtime_folder(folder: Path | None = None) -> Path:

@@ -11,15 +11,15 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.controller import Controller
-from serving.errors import LoopError
-from serving.fault import kind_of, lasting
-from serving.guard import Sample
-from serving.journal import Event, Journal, JournalReader, Scan
-from serving.journal.entries import Kind
-from serving.loop import Command, ControlLoop, Mode
-from serving.manifest import Manifest
-from serving.words import plain
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fault import kind_of, lasting
+from loopwright.serving.guard import Sample
+from loopwright.serving.journal import Event, Journal, JournalReader, Scan
+from loopwright.serving.journal.entries import Kind
+from loopwright.serving.loop import Command, ControlLoop, Mode
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.words import plain
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ def named(controller: Controller) -> str:
 
 
 def _numbers(m: Manifest, sample: Sample | None, command: Command) -> Iterator[float]:
-    """The columns of ``serving.journal.columns``."""
+    """The columns of ``loopwright.serving.journal.columns``."""
     n_mv = len(m.mv)
     yield from _listed(command.sp, len(m.sp))
     yield from _listed(None if sample is None else sample.pv, len(m.pv))

@@ -8,16 +8,16 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from serving.controller import Controller
-from serving.errors import LoopError, LoopwrightError
-from serving.file_lock import LockTakenError, locked
-from serving.journal.file import lock_of, opened
-from serving.opcua.nameplates import Identity
-from serving.page.address import listening, require_usable
-from serving.station.lease import Lease
-from serving.station.making import control_loop
-from serving.station.settings import Settings
-from serving.words import first_line
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopError, LoopwrightError
+from loopwright.serving.file_lock import LockTakenError, locked
+from loopwright.serving.journal.file import lock_of, opened
+from loopwright.serving.opcua.nameplates import Identity
+from loopwright.serving.page.address import listening, require_usable
+from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.making import control_loop
+from loopwright.serving.station.settings import Settings
+from loopwright.serving.words import first_line
 
 
 @dataclass

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, TypeAlias
 
-from serving.controller import Controller
-from serving.errors import LoopError
-from serving.fields import nearest
-from serving.fitted import require_fits
-from serving.journal.entries import Kind
-from serving.loop import ControlLoop, Mode, within
-from serving.manifest import Signal
-from serving.proof import require_accepted
-from serving.station.recorder import named
-from serving.trust import signer
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fields import nearest
+from loopwright.serving.fitted import require_fits
+from loopwright.serving.journal.entries import Kind
+from loopwright.serving.loop import ControlLoop, Mode, within
+from loopwright.serving.manifest import Signal
+from loopwright.serving.proof import require_accepted
+from loopwright.serving.station.recorder import named
+from loopwright.serving.trust import signer
 
 Opened: TypeAlias = Callable[[str, str | None], Controller]  # file, its pinned SHA-256 or None
 

@@ -9,15 +9,15 @@ from math import isfinite
 from pathlib import Path
 from typing import Literal
 
-from serving.errors import LoopError
-from serving.fallback import Fallback
-from serving.fields import nearest, parse
-from serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate
-from serving.manifest import Manifest, Signal
-from serving.opcua.settings import Nodes, Server
-from serving.page.settings import Page
-from serving.plain_values import refused
-from serving.words import first_line
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fallback import Fallback
+from loopwright.serving.fields import nearest, parse
+from loopwright.serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate
+from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.page.settings import Page
+from loopwright.serving.plain_values import refused
+from loopwright.serving.words import first_line
 
 MAX_AGE = 1.5  # periods: one answer may be late, two may not
 TRANSFER = 20.0  # periods
@@ -121,7 +121,8 @@ class Settings:
 
     ``trusted`` names public keys: only a controller that one of them signed is loaded, at the start and by a swap
     (None: any is). ``accept_unproven`` lets a controller into AUTO whose file does not prove it in closed loop, see
-    ``serving.proof``. ``page`` is HOST:PORT or a table (see ``serving.page.settings``); empty: none.
+    ``loopwright.serving.proof``. ``page`` is HOST:PORT or a table (see ``loopwright.serving.page.settings``); empty:
+    none.
     """
 
     controller: Path

@@ -13,22 +13,22 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from serving.clock import MonotonicClock
-from serving.controller import Controller
-from serving.errors import LoopError, LoopwrightError
-from serving.first_steps import tried
-from serving.grid import RunReport
-from serving.guard import Sample
-from serving.journal import Journal, JournalReader
-from serving.loop import Command, ControlLoop, Mode
-from serving.manifest import Manifest, Signal
-from serving.opcua.certificates import expiries
-from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.nameplates import Identity, others_since
-from serving.opcua.sampling import Values
-from serving.page.process import PageProcess
-from serving.proof import judged
-from serving.station.beginning import (
+from loopwright.serving.clock import MonotonicClock
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopError, LoopwrightError
+from loopwright.serving.first_steps import tried
+from loopwright.serving.grid import RunReport
+from loopwright.serving.guard import Sample
+from loopwright.serving.journal import Journal, JournalReader
+from loopwright.serving.loop import Command, ControlLoop, Mode
+from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.opcua.certificates import expiries
+from loopwright.serving.opcua.endpoint import OpcUaEndpoint
+from loopwright.serving.opcua.nameplates import Identity, others_since
+from loopwright.serving.opcua.sampling import Values
+from loopwright.serving.page.process import PageProcess
+from loopwright.serving.proof import judged
+from loopwright.serving.station.beginning import (
     another_before,
     begun_at,
     keep_namespaces,
@@ -38,24 +38,24 @@ from serving.station.beginning import (
     nodes_before,
     usable,
 )
-from serving.station.control import Answer, Control
-from serving.station.lease import Lease
-from serving.station.locks import Locks
-from serving.station.making import control_loop
-from serving.station.recorder import Recorder
-from serving.station.requests import Change, Request, change, require_proven
-from serving.station.said import Said
-from serving.station.settings import Settings
-from serving.station.tending import Tending
-from serving.station.views import about, picture, state
-from serving.station.watching import Watching
-from serving.station.wishes import Wishes
-from serving.trust import Controller as TrustedController
-from serving.trust import ending, signer
-from serving.words import first_line
+from loopwright.serving.station.control import Answer, Control
+from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.locks import Locks
+from loopwright.serving.station.making import control_loop
+from loopwright.serving.station.recorder import Recorder
+from loopwright.serving.station.requests import Change, Request, change, require_proven
+from loopwright.serving.station.said import Said
+from loopwright.serving.station.settings import Settings
+from loopwright.serving.station.tending import Tending
+from loopwright.serving.station.views import about, picture, state
+from loopwright.serving.station.watching import Watching
+from loopwright.serving.station.wishes import Wishes
+from loopwright.serving.trust import Controller as TrustedController
+from loopwright.serving.trust import ending, signer
+from loopwright.serving.words import first_line
 
 if TYPE_CHECKING:
-    from serving.signing.keys import PublicKey
+    from loopwright.serving.signing.keys import PublicKey
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -70,7 +70,8 @@ class Station:
     (set points and mode by their nodes). Every scan, change and fault goes into the journal.
 
     ``tell`` gets a line of each event, in a thread of its own: it may block or raise. ``controller`` is the one of the
-    settings' file; None: it is loaded here, once another process has taken its first steps (``serving.first_steps``).
+    settings' file; None: it is loaded here, once another process has taken its first steps
+    (``loopwright.serving.first_steps``).
 
     Raises LoopError and ArtifactError where the settings do not fit the controller, another loop writes the same
     nodes, or the journal cannot be opened.
@@ -313,7 +314,7 @@ class Station:
         """The keys as they are at the start: whoever changes their files later changes nothing here."""
         if self.settings.trusted is None:
             return None
-        from serving.signing.verify import public_keys  # here: it needs the package cryptography
+        from loopwright.serving.signing.verify import public_keys  # here: it needs the package cryptography
 
         return public_keys(self.settings.trusted)
 

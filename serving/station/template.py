@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from serving.controller import Controller
-from serving.manifest import Signal
-from serving.station.settings import MAX_AGE, TRANSFER
-from serving.words import plain
+from loopwright.serving.controller import Controller
+from loopwright.serving.manifest import Signal
+from loopwright.serving.station.settings import MAX_AGE, TRANSFER
+from loopwright.serving.words import plain
 
 
 def template(controller: Controller, path: Path, endpoint: str, journal: str = "loop.journal") -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from serving.words import named
+from loopwright.serving.words import named
 
 EVERY_S = 60.0  # an alarm of another loop ends so long after that loop at most
 

@@ -9,15 +9,15 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from serving.controller import Controller
-from serving.journal import columns
-from serving.opcua.values import words
-from serving.proof import judged
-from serving.trust import signer
-from serving.words import plain_tree
+from loopwright.serving.controller import Controller
+from loopwright.serving.journal import columns
+from loopwright.serving.opcua.values import words
+from loopwright.serving.proof import judged
+from loopwright.serving.trust import signer
+from loopwright.serving.words import plain_tree
 
 if TYPE_CHECKING:
-    from serving.station.station import Station
+    from loopwright.serving.station.station import Station
 
 View = dict[str, Any]
 

@@ -8,13 +8,13 @@ import time
 from contextlib import closing, suppress
 from math import ceil
 
-from serving.controller import Controller
-from serving.errors import LoopError
-from serving.guard import Sample
-from serving.journal import JournalReader
-from serving.loop import Command
-from serving.monitor import Monitor
-from serving.station.recorder import Recorder
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopError
+from loopwright.serving.guard import Sample
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.loop import Command
+from loopwright.serving.monitor import Monitor
+from loopwright.serving.station.recorder import Recorder
 
 ALARMING, ALARM = {"watch", "retrain"}, "monitor "
 LOOK_S, KEEP_S = 10.0, 600.0  # between two looks at the verdicts, and two writings of what was learnt

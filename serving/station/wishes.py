@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from serving.opcua.sampling import Values
+from loopwright.serving.opcua.sampling import Values
 
 MODE = "mode"
 

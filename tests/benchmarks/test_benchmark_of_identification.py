@@ -10,7 +10,7 @@ import pytest
 from benchmark_modules import benchmark_modules
 from scipy.io import savemat
 
-from pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.dynamics import Dynamics
 
 MODULES = ("_free_run", "_made_records", "_public_records", "_users_path", "identification")
 NOISE = {"made_tanks": 0.02, "made_drive": 0.02, "made_friction": 0.02, "made_duffing": 0.2}  # in the unit of figures

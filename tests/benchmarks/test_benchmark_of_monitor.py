@@ -6,7 +6,7 @@ import pytest
 from benchmark_modules import benchmark_script
 from monitor_drifts import DRIFTS, assert_found_and_quiet_without
 
-from pipeline.cases import CASES
+from loopwright.pipeline.cases import CASES
 
 
 def test_every_case_is_among_them() -> None:

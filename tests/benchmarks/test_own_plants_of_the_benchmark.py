@@ -9,7 +9,7 @@ import pytest
 import torch
 from benchmark_modules import own_plants_modules
 
-from pipeline.simulation.simulate import simulate_closed
+from loopwright.pipeline.simulation.simulate import simulate_closed
 
 MODULES = ("plant", "development", "untouched", "record", "loops")
 

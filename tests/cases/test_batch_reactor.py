@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.cases.batch_reactor.plant import BatchReactor
-from pipeline.errors import PlantError
-from pipeline.simulation.simulate import simulate_open
+from loopwright.pipeline.cases.batch_reactor.plant import BatchReactor
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.simulation.simulate import simulate_open
 
 
 @pytest.fixture(scope="module")

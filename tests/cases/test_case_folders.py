@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.cases import CASES, PLANTS
-from pipeline.evaluation.case import Case
-from pipeline.simulation.scenario import NOISE_SUFFIX
+from loopwright.pipeline.cases import CASES, PLANTS
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 ROOT = Path(__file__).parents[2]
 FOLDERS = {case.name: ROOT.joinpath(*type(case).__module__.split(".")[:-1]) for case in CASES.values()}

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.cases import CASES
-from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
-from pipeline.commands.simulate import _test_of as first_scenario
-from pipeline.engine.command import run_stage
-from pipeline.errors import ParamsError, PlantError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.closed_loop import closed_loop_metrics
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from loopwright.pipeline.commands.simulate import _test_of as first_scenario
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.errors import ParamsError, PlantError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 DISTURBANCES = {"tin", "ua", "ua_gradual"}
 
@@ -188,7 +188,7 @@ def test_curves_are_labelled_as_in_the_paper(cstr: Case) -> None:
 
 
 def test_cases_do_not_load_torch() -> None:
-    code = "import sys, json, pipeline.cases; print(json.dumps('torch' in sys.modules))"
+    code = "import sys, json, loopwright.pipeline.cases; print(json.dumps('torch' in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) is False
 

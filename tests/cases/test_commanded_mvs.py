@@ -10,16 +10,16 @@ import yaml
 from identified_models import scaled_model
 from own_cases import GAINS, POLES, case_of, loop_of, section, two_lags
 
-from pipeline.cases.own_plant import OwnCase, own_case
-from pipeline.cases.reach import visited_mv
-from pipeline.errors import ParamsError
-from pipeline.evaluation.reached import beyond
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.models.base import load_model
-from pipeline.optimal.sampled import SampledHorizon, run_sampled
-from pipeline.records.record import Record
-from pipeline.simulation.scenario import Scenario
-from serving.manifest import Signal
+from loopwright.pipeline.cases.own_plant import OwnCase, own_case
+from loopwright.pipeline.cases.reach import visited_mv
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.evaluation.reached import beyond
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.models.base import load_model
+from loopwright.pipeline.optimal.sampled import SampledHorizon, run_sampled
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.serving.manifest import Signal
 
 LOW, HIGH, MOVE = -0.35, 0.15, 0.02  # of u0; the record visits -0.6 to 0.6
 SETTINGS = {"predictive": {"horizon": 15, "moves": 4}, "pid": {"development_seeds": (1,), "development_set_points": 2}}

@@ -10,15 +10,15 @@ import pytest
 from identified_models import scaled_model
 from own_cases import case_of, loop_of, section
 
-from pipeline.cases.daily_work import LEAST, MOST, day, spread, windows
-from pipeline.cases.own_model import OwnPlant
-from pipeline.cases.own_plant import DAILY, OwnCase
-from pipeline.evaluation.trials import Trials
-from pipeline.laws.pid.pid import PID
-from pipeline.metrics import mae
-from pipeline.records.set_points import SetPoints, stretches
-from pipeline.simulation.simulate import simulate_closed
-from pipeline.tuning.rules import PidSettings
+from loopwright.pipeline.cases.daily_work import LEAST, MOST, day, spread, windows
+from loopwright.pipeline.cases.own_model import OwnPlant
+from loopwright.pipeline.cases.own_plant import DAILY, OwnCase
+from loopwright.pipeline.evaluation.trials import Trials
+from loopwright.pipeline.laws.pid.pid import PID
+from loopwright.pipeline.metrics import mae
+from loopwright.pipeline.records.set_points import SetPoints, stretches
+from loopwright.pipeline.simulation.simulate import simulate_closed
+from loopwright.pipeline.tuning.rules import PidSettings
 
 KC, TI_S, ROWS = 0.15, 12.0, 1500
 POLES = (0.9, 0.93, 0.85)  # of the law's model, and of the plants of the tests: none is the record's

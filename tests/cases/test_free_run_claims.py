@@ -7,10 +7,13 @@ from typing import Any
 
 import pytest
 
-from pipeline.cases import CASES
-from pipeline.cases.reversible_cstr.reference_models import beats_the_classic_tables, reference_models_picture
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.pictures.free_runs import free_run_fit_at_least, free_run_picture, one_step_says_little
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.reversible_cstr.reference_models import (
+    beats_the_classic_tables,
+    reference_models_picture,
+)
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.pictures.free_runs import free_run_fit_at_least, free_run_picture, one_step_says_little
 
 
 def row(near: float, fit: float) -> dict[str, float]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import COLD, HOT, FuzzyBatchReactor
-from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
-from pipeline.errors import PlantError
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import COLD, HOT, FuzzyBatchReactor
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from loopwright.pipeline.errors import PlantError
 
 
 def after(plant: FuzzyBatchReactor, x: np.ndarray, mv: np.ndarray) -> np.ndarray:

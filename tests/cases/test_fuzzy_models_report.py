@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from pipeline.cases import CASES
-from pipeline.cases.jacketed_batch_reactor.excitations import JacketPulses
-from pipeline.cases.jacketed_batch_reactor.fuzzy_models import (
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.jacketed_batch_reactor.excitations import JacketPulses
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_models import (
     SET,
     coefficients_picture,
     drift_when_shut,
@@ -19,11 +19,11 @@ from pipeline.cases.jacketed_batch_reactor.fuzzy_models import (
     reach_picture,
     weak_cold_valve,
 )
-from pipeline.cases.jacketed_batch_reactor.models import PrintedFuzzyPart, printed_model
-from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart
-from pipeline.models.part import Part, Source
+from loopwright.pipeline.cases.jacketed_batch_reactor.models import PrintedFuzzyPart, printed_model
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart
+from loopwright.pipeline.models.part import Part, Source
 
 CHECKS = (one_step_errors, gaps, weak_cold_valve)
 

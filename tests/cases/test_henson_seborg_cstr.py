@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from henson_seborg_cstr_parts import local_models
 
-from pipeline.cases import CASES
-from pipeline.cases.henson_seborg_cstr.case import HELD_OUT_RANGE, HOLD
-from pipeline.cases.henson_seborg_cstr.paper import CLAIMS, hopf_point, rekindling_flow, ultimate_gain
-from pipeline.cases.henson_seborg_cstr.pictures import PICTURES
-from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.verdicts import close
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.henson_seborg_cstr.case import HELD_OUT_RANGE, HOLD
+from loopwright.pipeline.cases.henson_seborg_cstr.paper import CLAIMS, hopf_point, rekindling_flow, ultimate_gain
+from loopwright.pipeline.cases.henson_seborg_cstr.pictures import PICTURES
+from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.verdicts import close
 
 CASE = CASES["henson_seborg_cstr"]
 

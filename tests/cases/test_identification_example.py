@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cases.ph_neutralization.identification_example import IdentificationExamplePart, example_record
-from pipeline.cases.ph_neutralization.models import MODELS
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.config.params import parse
-from pipeline.models import Learnt
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.part import Source
+from loopwright.pipeline.cases.ph_neutralization.identification_example import IdentificationExamplePart, example_record
+from loopwright.pipeline.cases.ph_neutralization.models import MODELS
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.models import Learnt
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.part import Source
 
 N = 100
 

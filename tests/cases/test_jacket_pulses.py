@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cases.jacketed_batch_reactor.excitations import EXCITATIONS, JacketPulses
-from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.errors import ParamsError, PlantError
-from pipeline.records.record import Record
-from pipeline.simulation.simulate import simulate_open
+from loopwright.pipeline.cases.jacketed_batch_reactor.excitations import EXCITATIONS, JacketPulses
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.errors import ParamsError, PlantError
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.simulate import simulate_open
 
 
 @pytest.fixture(scope="module")

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.cases import CASES
-from pipeline.cases.jacketed_batch_reactor.case import OBSERVER
-from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
-from pipeline.cases.jacketed_batch_reactor.paper import CLAIMS, _quiet
-from pipeline.cases.jacketed_batch_reactor.pictures import PICTURES
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.law_evidence import Form, LawEvidence, LawMetrics
-from pipeline.evaluation.metric import together
-from pipeline.report.verdicts import judge
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.jacketed_batch_reactor.case import OBSERVER
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
+from loopwright.pipeline.cases.jacketed_batch_reactor.paper import CLAIMS, _quiet
+from loopwright.pipeline.cases.jacketed_batch_reactor.pictures import PICTURES
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import Form, LawEvidence, LawMetrics
+from loopwright.pipeline.evaluation.metric import together
+from loopwright.pipeline.report.verdicts import judge
+from loopwright.pipeline.simulation.scenario import Scenario
 
 CASE = CASES["jacketed_batch_reactor"]
 

@@ -13,17 +13,17 @@ import torch
 from identified_models import first_order
 from own_cases import case_of, section
 
-from pipeline.cases.measured_steps import ROOM
-from pipeline.cases.own_plant import GATE, LOAD_AT, MEASURED, OwnCase
-from pipeline.errors import ParamsError, PlantError
-from pipeline.evaluation.trial import close_loop
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.models import load_model
-from pipeline.optimal.sampled import SampledHorizon, run_sampled
-from pipeline.plants.identified import IdentifiedPlant
-from pipeline.simulation.simulate import Trajectory, simulate_closed
-from pipeline.simulation.timetable import Timetable, parse_event, timetable
-from serving.controller import Controller
+from loopwright.pipeline.cases.measured_steps import ROOM
+from loopwright.pipeline.cases.own_plant import GATE, LOAD_AT, MEASURED, OwnCase
+from loopwright.pipeline.errors import ParamsError, PlantError
+from loopwright.pipeline.evaluation.trial import close_loop
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.models import load_model
+from loopwright.pipeline.optimal.sampled import SampledHorizon, run_sampled
+from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
+from loopwright.pipeline.simulation.timetable import Timetable, parse_event, timetable
+from loopwright.serving.controller import Controller
 
 POLES, GAIN = (0.8, 0.78, 0.82), 2.0
 INFLOW = {"name": "d0", "unit": "V", "low": -1.0, "high": 1.0}

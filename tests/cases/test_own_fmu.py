@@ -11,19 +11,19 @@ import pytest
 import yaml
 from fmu_parts import EXAMPLE, FMI_2, fmu
 
-from pipeline.__main__ import main
-from pipeline.cases import all_cases
-from pipeline.cases.own_simulator import SimulatedCase
-from pipeline.commands.new_fmu import MISSING, proposals, table_from
-from pipeline.commands.new_simulated import SLOW, WANTED, simulated
-from pipeline.excitation.first_test import first_test
-from pipeline.files import sha256
-from pipeline.historian.tags import Tag
-from pipeline.plants.fmu.description import described
-from pipeline.plants.fmu.instance import Instance
-from pipeline.plants.simulator_file import FileSimulator
-from pipeline.stages.check import mistakes
-from serving.manifest import Signal
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.cases.own_simulator import SimulatedCase
+from loopwright.pipeline.commands.new_fmu import MISSING, proposals, table_from
+from loopwright.pipeline.commands.new_simulated import SLOW, WANTED, simulated
+from loopwright.pipeline.excitation.first_test import first_test
+from loopwright.pipeline.files import sha256
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.plants.fmu.description import described
+from loopwright.pipeline.plants.fmu.instance import Instance
+from loopwright.pipeline.plants.simulator_file import FileSimulator
+from loopwright.pipeline.stages.check import mistakes
+from loopwright.serving.manifest import Signal
 
 ROLES = ["--pv", "oxygen", "--mv", "air[%]", "--dv", "uptake=24..40"]
 ROWS = ["--rows", "600"]
@@ -41,7 +41,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def without_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draws no pictures, which take most of the time of a small record."""
-    monkeypatch.setattr("pipeline.commands.new.write_page", lambda path, *of: path.write_text(""))
+    monkeypatch.setattr("loopwright.pipeline.commands.new.write_page", lambda path, *of: path.write_text(""))
 
 
 def new(*arguments: object) -> int:
@@ -105,7 +105,7 @@ def test_nothing_is_asked_where_the_fmu_says_all(here: Path) -> None:
 def test_a_short_step_for_a_fast_solver_becomes_a_period_that_suits_the_plant(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.excitation.first_test.LONGEST", 640)
+    monkeypatch.setattr("loopwright.pipeline.excitation.first_test.LONGEST", 640)
     path = fmu(here, CLEAR.replace('stepSize="30"', 'stepSize="1.5"'))  # it settles in 1060 of them
     table = table_from(path, (), "", None)
     assert table is not None

@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.cases import CASES, all_cases
-from pipeline.cases.loads import LOAD
-from pipeline.cases.own_model import LEAST_GAIN, Doubts, OwnPlant
-from pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
-from pipeline.errors import ParamsError, PlantError
-from pipeline.historian.pace import MOST_PERIODS
-from pipeline.models.identified.assembly import remembering
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.plants.signals import Signals
-from pipeline.plants.spoilt import SpoiltPlant
-from pipeline.records.record import Record
-from pipeline.simulation.simulate import noise_draws, simulate_closed
-from pipeline.tuning.responses import StepResponses
-from serving.manifest import Signal
+from loopwright.pipeline.cases import CASES, all_cases
+from loopwright.pipeline.cases.loads import LOAD
+from loopwright.pipeline.cases.own_model import LEAST_GAIN, Doubts, OwnPlant
+from loopwright.pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
+from loopwright.pipeline.errors import ParamsError, PlantError
+from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.models.identified.assembly import remembering
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.spoilt import SpoiltPlant
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.simulate import noise_draws, simulate_closed
+from loopwright.pipeline.tuning.responses import StepResponses
+from loopwright.serving.manifest import Signal
 
 TEMPERATURE = {"name": "TIC-101.PV", "unit": "degC", "low": 20.0, "high": 90.0}
 VALVE = {"name": "TIC-101.OP", "unit": "%", "low": 0.0, "high": 100.0}

@@ -9,14 +9,14 @@ import pytest
 import yaml
 from own_cases import GAINS, POLES, RATE, filled_level, loop_of, section, two_lags
 
-from pipeline.cases.own_plant import PERCENT, OwnCase, own_case
-from pipeline.errors import ParamsError
-from pipeline.evaluation.closed_loop import locked_up
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.models.base import load_model
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import Trajectory
-from pipeline.simulation.timetable import parse_event, timetable
+from loopwright.pipeline.cases.own_plant import PERCENT, OwnCase, own_case
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.evaluation.closed_loop import locked_up
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.models.base import load_model
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import Trajectory
+from loopwright.pipeline.simulation.timetable import parse_event, timetable
 
 
 @pytest.fixture

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.__main__ import main
-from pipeline.cases import all_cases
-from pipeline.cases.loads import LOAD
-from pipeline.cases.own_model import OwnPlant
-from pipeline.cases.own_simulator import SimulatedCase
-from pipeline.plants.simulator_file import FileSimulator
-from pipeline.simulation.simulate import simulate_closed
-from pipeline.stages.check import mistakes
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.cases.loads import LOAD
+from loopwright.pipeline.cases.own_model import OwnPlant
+from loopwright.pipeline.cases.own_simulator import SimulatedCase
+from loopwright.pipeline.plants.simulator_file import FileSimulator
+from loopwright.pipeline.simulation.simulate import simulate_closed
+from loopwright.pipeline.stages.check import mistakes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_simulator" / "heater.py"
 
@@ -96,7 +96,7 @@ def test_the_controller_s_range_is_not_the_experiment_s(
     Path("params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
     new = ["new", "heater", "--simulator", str(EXAMPLE), "--rows", "600"]
     with monkeypatch.context() as patch:
-        patch.setattr("pipeline.commands.new.simulated", lambda *_: pytest.fail("the experiment has begun"))
+        patch.setattr("loopwright.pipeline.commands.new.simulated", lambda *_: pytest.fail("the experiment has begun"))
         assert main([*new, "--command", "valve=70..90"]) == 2
     error = capsys.readouterr().err
     assert "the simulator starts with valve = " in error

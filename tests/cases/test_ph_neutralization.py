@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from pipeline.cases.ph_neutralization.plant import PhNeutralization, PhNeutralization15s, ph_of
+from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization, PhNeutralization15s, ph_of
 
 PK1, PK2 = 6.35, 10.25
 

@@ -6,11 +6,11 @@ import matplotlib
 import numpy as np
 import pytest
 
-from pipeline.cases import CASES
-from pipeline.cases.reversible_cstr.case import HOLD, LEVELS
-from pipeline.cases.reversible_cstr.paper import CLAIMS
-from pipeline.cases.reversible_cstr.pictures import PICTURES
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.reversible_cstr.case import HOLD, LEVELS
+from loopwright.pipeline.cases.reversible_cstr.paper import CLAIMS
+from loopwright.pipeline.cases.reversible_cstr.pictures import PICTURES
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 
 CASE = CASES["reversible_cstr"]
 

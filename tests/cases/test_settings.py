@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.cases import CASES
-from pipeline.config.params import ControllerParams, sections
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.config.params import ControllerParams, sections
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics
 
 
 def asked(value: Any) -> Iterator[tuple[str, Mapping[str, Any]]]:

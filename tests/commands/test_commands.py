@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.__main__ import main
-from pipeline.commands import COMMANDS, Parser
-from pipeline.commands.parameters import texts, type_of
-from pipeline.laws import LAWS
-from pipeline.models import MODELS
-from serving.arguments import write_any_text
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.commands import COMMANDS, Parser
+from loopwright.pipeline.commands.parameters import texts, type_of
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.models import MODELS
+from loopwright.serving.arguments import write_any_text
 
 ROOT = Path(__file__).parents[2]
 COMMANDS_OF_TODAY = {
@@ -29,7 +29,7 @@ COMMANDS_OF_TODAY = {
 def test_the_commands_are_these() -> None:
     assert set(COMMANDS) == COMMANDS_OF_TODAY
     for name in COMMANDS:
-        module = importlib.import_module(f"pipeline.commands.{name}")
+        module = importlib.import_module(f"loopwright.pipeline.commands.{name}")
         assert callable(module.options)
         assert callable(module.run)
 
@@ -114,7 +114,7 @@ def test_every_parameter_of_a_model_is_shown_and_explained(kind: str, capsys: py
 
 def test_help_loads_no_library_of_the_work() -> None:
     code = """import sys
-from pipeline.__main__ import main
+from loopwright.pipeline.__main__ import main
 main([])
 sys.exit(len({'torch', 'casadi', 'mlflow'} & set(sys.modules)))
 """
@@ -131,7 +131,7 @@ def test_the_type_of_a_parameter_does_not_depend_on_how_its_module_reads_annotat
 def parsed(*words: str) -> dict[str, object]:
     """What a command reads in its words."""
     parser = Parser(prog=words[0])
-    importlib.import_module(f"pipeline.commands.{words[0]}").options(parser)
+    importlib.import_module(f"loopwright.pipeline.commands.{words[0]}").options(parser)
     found = vars(parser.parse_args(words[1:]))
     return {key: value for key, value in found.items() if not callable(value)}
 
@@ -198,7 +198,7 @@ def test_a_command_runs_where_the_streams_are_ascii(module: str) -> None:
         "inspect",
         str(ROOT / "artifacts" / "jacketed_batch_reactor" / "fuzzy_feedforward_pi.onnx"),
     ]
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONPATH": str(ROOT / "tools/roots")}
     done = subprocess.run(command, env=environment, capture_output=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, b"")
     assert b"\\xb0C" in done.stdout

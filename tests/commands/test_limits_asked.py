@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pipeline.commands.new_commands import confirmed
-from pipeline.historian.tags import Tag
-from serving.manifest import Signal
+from loopwright.pipeline.commands.new_commands import confirmed
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.serving.manifest import Signal
 
 SIGNALS = (Signal("OP", "%", 0.0, 100.0), Signal("damper", "%", 0.0, 90.0))
 FREE = (Tag("OP", "mv", "%", 0.0, 100.0, "OP"), Tag("the damper", "mv", "%", 0.0, 90.0, "damper"))

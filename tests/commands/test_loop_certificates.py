@@ -14,9 +14,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from plant_servers import Plant, RunningLoop
 from processes import within
 
-from pipeline.__main__ import main
-from serving import LoopError
-from serving.opcua.certificates import Expiry, make, valid_until
+from loopwright.pipeline.__main__ import main
+from loopwright.serving import LoopError
+from loopwright.serving.opcua.certificates import Expiry, make, valid_until
 
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
 

@@ -16,17 +16,17 @@ import pytest
 from plant_servers import Plant, RunningLoop, spoil
 from processes import within
 
-from pipeline.__main__ import main
-from pipeline.export.controller_file import with_evidence
-from serving import Controller, LoopError, Signal
-from serving.journal import Journal
-from serving.opcua.inspection import _refused, _unfit, inspected
-from serving.opcua.nameplates import other_unit
-from serving.opcua.plan import Role, Row
-from serving.opcua.settings import Point
-from serving.station.command import JOURNAL_LOST
-from serving.station.lease import Lease
-from serving.station.settings import Settings
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.export.controller_file import with_evidence
+from loopwright.serving import Controller, LoopError, Signal
+from loopwright.serving.journal import Journal
+from loopwright.serving.opcua.inspection import _refused, _unfit, inspected
+from loopwright.serving.opcua.nameplates import other_unit
+from loopwright.serving.opcua.plan import Role, Row
+from loopwright.serving.opcua.settings import Point
+from loopwright.serving.station.command import JOURNAL_LOST
+from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.settings import Settings
 
 ROOT = Path(__file__).parents[2]
 PID = ROOT / "artifacts" / "thiosulfate_cstr" / "pid.onnx"

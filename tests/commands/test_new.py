@@ -17,15 +17,15 @@ from closed_loop_records import OperatedLoop
 from dirty_plant import START_S, TAGS, Clean, cells, clean, write
 from undrawn import draw_nothing
 
-from pipeline.__main__ import main
-from pipeline.cases import all_cases
-from pipeline.config.exports import screened_record
-from pipeline.config.plants import PlantParams
-from pipeline.files import sha256
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record
-from pipeline.stages.screen import screen
-from serving.manifest import Signal
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.config.exports import screened_record
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.files import sha256
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.stages.screen import screen
+from loopwright.serving.manifest import Signal
 
 ROOT = Path(__file__).parents[2]
 ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]"]

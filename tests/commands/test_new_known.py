@@ -11,15 +11,15 @@ import yaml
 from dirty_plant import cells, clean, write
 from undrawn import draw_nothing
 
-from pipeline.__main__ import main
-from pipeline.cases import all_cases
-from pipeline.config.known import Known
-from pipeline.config.plants import PlantParams
-from pipeline.historian.exported import exported, signal_tags
-from pipeline.historian.guessing import controlled_first, loop_in
-from pipeline.historian.loop_rows import _partner
-from pipeline.historian.tags import Tag, read_tags
-from pipeline.stages.fit import _source
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.historian.exported import exported, signal_tags
+from loopwright.pipeline.historian.guessing import controlled_first, loop_in
+from loopwright.pipeline.historian.loop_rows import _partner
+from loopwright.pipeline.historian.tags import Tag, read_tags
+from loopwright.pipeline.stages.fit import _source
 
 ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]"]
 NEW = ["new", "tank", "x.csv", *ROLES]

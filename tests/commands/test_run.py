@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.__main__ import main
-from pipeline.commands import run
-from pipeline.commands.run import chain_of, plan, reasons, side_by_side, stages_of
-from pipeline.errors import ParamsError, PipelineError
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.commands import run
+from loopwright.pipeline.commands.run import chain_of, plan, reasons, side_by_side, stages_of
+from loopwright.pipeline.errors import ParamsError, PipelineError
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from own_cases import controllers_of_a_lag
 
-from pipeline.__main__ import main
-from pipeline.cases import CASES
-from pipeline.commands.plant import start_of
-from pipeline.errors import PlantError
-from pipeline.simulation import opcua_server
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.commands.plant import start_of
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.simulation import opcua_server
 
 
 def test_its_model_is_served_where_it_rests(

@@ -15,17 +15,17 @@ import pytest
 from rich.console import Console
 from rich.live import Live
 
-from pipeline import commands
-from pipeline.__main__ import main
-from pipeline.cases import CASES
-from pipeline.errors import PlantError
-from pipeline.export.gate import export
-from pipeline.laws import LAWS
-from pipeline.metrics import mae
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.live import SimulatedPlant, TerminalView, sparkline
-from pipeline.simulation.simulate import simulate_closed
-from serving import Controller, Mode, VirtualClock
+from loopwright.pipeline import commands
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.metrics import mae
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.live import SimulatedPlant, TerminalView, sparkline
+from loopwright.pipeline.simulation.simulate import simulate_closed
+from loopwright.serving import Controller, Mode, VirtualClock
 
 CASE = "thiosulfate_cstr"
 pytest_plugins = ["small_laws"]
@@ -231,7 +231,7 @@ def test_a_controller_of_another_plant_is_refused(
 
 def test_as_a_program(pid_file: Path) -> None:
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-W", "error", "-m", "pipeline", *arguments]
+        command = [sys.executable, "-W", "error", "-m", "loopwright.pipeline", *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
     done = run("simulate", str(pid_file), "--sp", "0.6", "--duration", "10", "--picture", "loop.svg")

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from undrawn import draw_nothing
 
-from pipeline.__main__ import main
+from loopwright.pipeline.__main__ import main
 
 ROOT = Path(__file__).parents[2]
 PH = ROOT / "artifacts/ph_neutralization/pid.onnx"
@@ -75,7 +75,7 @@ def test_a_controller_of_no_case_is_refused(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copy(PH, "pid.onnx")
-    monkeypatch.setattr("pipeline.commands.stress.all_cases", dict)
+    monkeypatch.setattr("loopwright.pipeline.commands.stress.all_cases", dict)
     assert main(["stress", "pid.onnx"]) == 2
     assert "the controller is for 'ph_neutralization', which is no case here" in capsys.readouterr().err
 

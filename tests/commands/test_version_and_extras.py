@@ -12,10 +12,11 @@ from pathlib import Path
 import grimp
 import pytest
 
-import serving
-from pipeline.__main__ import main
-from pipeline.commands.extras import advice, extra_of
-from pipeline.stages import check
+from loopwright import serving
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.commands.extras import advice, extra_of
+from loopwright.pipeline.stages import check
+from loopwright.pipeline.stages.code import PACKAGES
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -31,7 +32,7 @@ def test_the_version_is_the_same_everywhere(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_every_package_that_the_sources_import_is_asked_for_by_an_extra() -> None:
-    graph = grimp.build_graph("serving", "pipeline", include_external_packages=True, cache_dir=None)
+    graph = grimp.build_graph(*PACKAGES, include_external_packages=True, cache_dir=None)
     imported = {m for m in graph.modules if graph.is_module_squashed(m)} - sys.stdlib_module_names
     base = {re.split(r"[<>=]", line)[0] for line in PROJECT["dependencies"]}
     brought = {module: extra_of(module) for module in imported - base}
@@ -60,7 +61,7 @@ def test_what_takes_half_a_second_to_load_is_loaded_where_it_is_used() -> None:
 def test_a_command_without_its_packages_names_the_extra_in_one_line(words: str, blocked: str, extra: str) -> None:
     code = f"""import sys
 sys.modules[{blocked!r}] = None
-from pipeline.__main__ import main
+from loopwright.pipeline.__main__ import main
 sys.exit(main({words.split()!r}))"""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     name = words.split()[0]
@@ -71,10 +72,10 @@ sys.exit(main({words.split()!r}))"""
 
 
 def test_a_missing_module_of_our_own_is_a_fault_and_stays_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pipeline.commands.inspect", None)
+    monkeypatch.setitem(sys.modules, "loopwright.pipeline.commands.inspect", None)
     with pytest.raises(ModuleNotFoundError, match=r"pipeline\.commands\.inspect"):
         main(["inspect", "x.onnx"])
-    assert advice("pipeline.commands.inspect") is None
+    assert advice("loopwright.pipeline.commands.inspect") is None
 
 
 def test_check_says_once_that_a_wheel_holds_no_bounds(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.config.entries import add_entries
-from pipeline.errors import ParamsError
+from loopwright.pipeline.config.entries import add_entries
+from loopwright.pipeline.errors import ParamsError
 
 TEXT = """# Settings.
 cases:

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.config.known import Known, stated, together
-from pipeline.config.plants import PlantParams
-from pipeline.errors import ParamsError
+from loopwright.pipeline.config.known import Known, stated, together
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.errors import ParamsError
 
 INF = float("inf")
 

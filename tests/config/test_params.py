@@ -11,9 +11,9 @@ import pytest
 import yaml
 from shipped import required
 
-from pipeline import errors
-from pipeline.cases import CASES
-from pipeline.config.params import (
+from loopwright.pipeline import errors
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.config.params import (
     ControllerParams,
     ModelParams,
     RecordParams,
@@ -22,13 +22,13 @@ from pipeline.config.params import (
     read_section,
     sections,
 )
-from pipeline.errors import ParamsError, PipelineError
-from pipeline.evaluation.evidence import NotMeasuredError
-from pipeline.files import digest
-from pipeline.laws import LAWS
-from pipeline.models import MODELS
-from pipeline.stages.excite import excitations
-from pipeline.stages.fit import parts_of
+from loopwright.pipeline.errors import ParamsError, PipelineError
+from loopwright.pipeline.evaluation.evidence import NotMeasuredError
+from loopwright.pipeline.files import digest
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.models import MODELS
+from loopwright.pipeline.stages.excite import excitations
+from loopwright.pipeline.stages.fit import parts_of
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.config.entries import add_entries
-from pipeline.config.plants import PlantParams, check_name
-from pipeline.errors import ParamsError
+from loopwright.pipeline.config.entries import add_entries
+from loopwright.pipeline.config.plants import PlantParams, check_name
+from loopwright.pipeline.errors import ParamsError
 
 ROOT = Path(__file__).parents[2]
 T = {"name": "TIC-101.PV", "unit": "degC", "low": 0.0, "high": 1e-5}

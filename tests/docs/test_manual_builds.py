@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from pages import ROOT
 
-from pipeline.laws import LAWS
+from loopwright.pipeline.laws import LAWS
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("furo") is None or importlib.util.find_spec("myst_parser") is None,

@@ -22,14 +22,14 @@ from manual.commands import parser_of
 from pages import FENCE, PAGES, ROOT, Block, blocks
 from stated import assert_stated
 
-from pipeline.commands import COMMANDS
-from pipeline.config.exports import ExportParams
-from pipeline.config.known import Known
-from pipeline.config.params import CaseParams, ControllerParams, ModelParams, RecordParams, parse
-from pipeline.excitation import EXCITATIONS
-from pipeline.laws import LAWS
-from pipeline.models import MODELS
-from serving.station.settings import Settings
+from loopwright.pipeline.commands import COMMANDS
+from loopwright.pipeline.config.exports import ExportParams
+from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.config.params import CaseParams, ControllerParams, ModelParams, RecordParams, parse
+from loopwright.pipeline.excitation import EXCITATIONS
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.models import MODELS
+from loopwright.serving.station.settings import Settings
 
 LANGUAGES = {"python", "sh", "bash", "yaml", "toml", "text", "", "{generated}", "{diagram}", "{toctree}", "{eval-rst}"}
 ALL = [block for page in PAGES for block in blocks(page)]
@@ -103,7 +103,7 @@ def test_the_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pyte
 
 
 def _run(file: str, folder: Path) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
     done = subprocess.run([sys.executable, file], cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{file}: {done.stderr[-2000:]}"
     return done.stdout
@@ -143,7 +143,12 @@ def test_commands_are_those_that_there_are(block: Block, capsys: pytest.CaptureF
 
 def _check_python(rest: list[str], block: Block) -> None:
     if rest[0] == "-m":
-        assert rest[1] in {"venv", "serving", "pipeline.engine.start", "pipeline.playground.web_runtime"}, block.where
+        assert rest[1] in {
+            "venv",
+            "serving",
+            "loopwright.pipeline.engine.start",
+            "loopwright.pipeline.playground.web_runtime",
+        }, block.where
     else:
         made = {name for b in blocks(block.page) for name in re.findall(r"`(\w+\.py)`", b.page.read_text("utf-8"))}
         assert (ROOT / rest[0]).exists() or rest[0] in made, f"{block.where}: no {rest[0]}"

@@ -16,16 +16,16 @@ from manual.laws import info_of, shipped, told
 from manual.parameters import fields, is_described, parameters, parts_of, words
 from pages import DOCS, ROOT
 
-import serving
-from pipeline.cases import CASES
-from pipeline.evaluation.metric import METRICS
-from pipeline.evaluation.validation import Validation
-from pipeline.excitation import EXCITATIONS
-from pipeline.laws import LAWS
-from pipeline.models import MODELS
-from pipeline.models.training.fit import TRAINERS
-from serving.manifest import Manifest
-from serving.station.settings import Settings
+from loopwright import serving
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.evaluation.metric import METRICS
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.excitation import EXCITATIONS
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.models import MODELS
+from loopwright.pipeline.models.training.fit import TRAINERS
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.station.settings import Settings
 
 ROOTS: dict[str, type] = {
     **{f"law {name}": law.Params for name, law in LAWS.items()},

@@ -16,8 +16,8 @@ from pages import PAGES, ROOT, Block, blocks
 from stated import assert_stated, says
 from test_manual_code_blocks import commands_of
 
-from pipeline.__main__ import main
-from serving.__main__ import main as serving
+from loopwright.pipeline.__main__ import main
+from loopwright.serving.__main__ import main as serving
 
 EMPTY = "cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n"
 
@@ -48,7 +48,7 @@ def run(words: list[str]) -> None:
         if "--check" in words:  # the answers of a host
             run(["python", "examples/embed/python/conformance.py", words[3], words[-1]])
         assert main(rest) == 0, words
-    elif program == "python" and rest[:2] == ["-m", "serving"]:
+    elif program == "python" and rest[:2] == ["-m", "loopwright.serving"]:
         assert not serving(rest[2:]), words
     elif program == "python":
         with pytest.MonkeyPatch.context() as patch:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from pipeline.engine.announcements import Announcements, words_of
+from loopwright.pipeline.engine.announcements import Announcements, words_of
 
 ROOT = Path(__file__).parents[2]
 WORDS = {"fit": "the models of the plant"}
@@ -28,7 +28,12 @@ def test_lines_of_a_stage_stay_and_those_on_files_of_dvc_go() -> None:
     said = Announcements([], WORDS).of
     assert said("fit a-one: linear models: 3 of 20\n") == "fit a-one: linear models: 3 of 20"
     for line in (
-        *("", "> python -m pipeline.engine.start fit a-one", "Updating lock file 'dvc.lock'", "\tgit add dvc.lock"),
+        *(
+            "",
+            "> python -m loopwright.pipeline.engine.start fit a-one",
+            "Updating lock file 'dvc.lock'",
+            "\tgit add dvc.lock",
+        ),
         *("To track the changes with git, run:", "Use `dvc push` to send your updates to remote storage."),
     ):
         assert said(line) is None

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pipeline.engine.bars import Bars
-from pipeline.engine.progress import Lines, Piece
-from pipeline.engine.spoken import BARS, MARK
+from loopwright.pipeline.engine.bars import Bars
+from loopwright.pipeline.engine.progress import Lines, Piece
+from loopwright.pipeline.engine.spoken import BARS, MARK
 
 
 def drawn(terminal: bool) -> tuple[Bars, io.StringIO]:
@@ -63,8 +63,12 @@ bars = os.environ.get({BARS!r})
 print({MARK + told!r} if bars else "fit a: networks: 50 % done", file=sys.stderr, flush=True)
 print("fit a: done", flush=True)
 """)
-    command = [sys.executable, "-m", "pipeline.engine.lanes", "--of", "fit@a", "repro"]
-    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}", "TERM": "xterm"}
+    command = [sys.executable, "-m", "loopwright.pipeline.engine.lanes", "--of", "fit@a", "repro"]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}/tools/roots",
+        "TERM": "xterm",
+    }
     plain = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
     assert plain.stdout.splitlines() == ["stage 1 of 1: fit a", "fit a: networks: 50 % done", "fit a: done"]
     ours, theirs = pty.openpty()

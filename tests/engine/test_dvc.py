@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.engine import dvc
-from pipeline.errors import PipelineError
+from loopwright.pipeline.engine import dvc
+from loopwright.pipeline.errors import PipelineError
 
 ROOT = Path(__file__).parents[2]
 # DVC itself, which says what its shell finds as `python` and then fails.
@@ -35,9 +35,13 @@ def test_python_is_this_python_even_behind_a_link(tmp_path: Path) -> None:
     link = tmp_path / "bin" / "python"
     link.parent.mkdir()
     link.symlink_to(sys.executable)
-    asked = "from pipeline.engine.dvc import environment; print(environment()['PATH'])"
+    asked = "from loopwright.pipeline.engine.dvc import environment; print(environment()['PATH'])"
     # The other folder's Python has no packages of its own.
-    bare = {**os.environ, "PATH": "/usr/bin:/bin", "PYTHONPATH": os.pathsep.join([str(ROOT), *site.getsitepackages()])}
+    bare = {
+        **os.environ,
+        "PATH": "/usr/bin:/bin",
+        "PYTHONPATH": os.pathsep.join([str(ROOT / "tools/roots"), *site.getsitepackages()]),
+    }
     done = subprocess.run([link, "-c", asked], env=bare, capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout == f"{link.parent}:/usr/bin:/bin\n"
 

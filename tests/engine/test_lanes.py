@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from processes import lives, within
 
-from pipeline.engine.start import DOOR
+from loopwright.pipeline.engine.start import DOOR
 
 ROOT = Path(__file__).parents[2]
 # In place of DVC: says what it was asked, then what the name of its last stage tells it to do.
@@ -62,9 +62,9 @@ def folder(tmp_path: Path) -> Path:
 
 
 def begin(folder: Path, *arguments: str) -> subprocess.Popen[str]:
-    environment: Mapping[str, str] = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+    environment: Mapping[str, str] = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}/tools/roots"}
     pipe = subprocess.PIPE
-    command = [sys.executable, "-m", "pipeline.engine.lanes", *arguments]
+    command = [sys.executable, "-m", "loopwright.pipeline.engine.lanes", *arguments]
     return subprocess.Popen(command, cwd=folder, env=environment, stdout=pipe, stderr=pipe, text=True)
 
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from engine_pieces import folder_of
 
-from pipeline.engine import pieces, start
-from pipeline.engine.cluster import address, workers_here
-from pipeline.engine.fingerprint import difference, fingerprint
-from pipeline.engine.folder import Folder, apply, read_files
-from pipeline.engine.parallel import as_done, lost, parallel_map
-from pipeline.errors import PipelineError
+from loopwright.pipeline.engine import pieces, start
+from loopwright.pipeline.engine.cluster import address, workers_here
+from loopwright.pipeline.engine.fingerprint import difference, fingerprint
+from loopwright.pipeline.engine.folder import Folder, apply, read_files
+from loopwright.pipeline.engine.parallel import as_done, lost, parallel_map
+from loopwright.pipeline.errors import PipelineError
 
 
 def test_results_come_in_the_order_of_the_items() -> None:
@@ -32,7 +32,7 @@ def test_an_error_of_one_piece_is_the_error_of_all() -> None:
 
 def test_a_cluster_that_does_not_answer_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://127.0.0.1:1")
-    monkeypatch.setattr("pipeline.engine.cluster.CONNECT_S", 0.2)
+    monkeypatch.setattr("loopwright.pipeline.engine.cluster.CONNECT_S", 0.2)
     with pytest.raises(PipelineError, match=r"no scheduler answers at tcp://127.0.0.1:1 .*start it"):
         parallel_map(math.sqrt, [1.0, 4.0], "roots")
 
@@ -41,7 +41,7 @@ def test_a_stage_whose_cluster_does_not_answer_ends_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", "tcp://127.0.0.1:1")
-    monkeypatch.setattr("pipeline.engine.cluster.CONNECT_S", 0.2)
+    monkeypatch.setattr("loopwright.pipeline.engine.cluster.CONNECT_S", 0.2)
     assert start.run(["excite", "thiosulfate_cstr-random_steps"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("excite thiosulfate_cstr-random_steps: no scheduler answers at tcp://127.0.0.1:1 ")

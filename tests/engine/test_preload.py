@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.engine import preload
-from pipeline.engine.start import STAGES
+from loopwright.pipeline.engine import preload
+from loopwright.pipeline.engine.start import STAGES
 
 ROOT = Path(__file__).parents[2]
 
@@ -106,21 +106,25 @@ def imported(monkeypatch: pytest.MonkeyPatch, stages: str | None) -> list[str]:
 def test_a_worker_for_anything_imports_everything(monkeypatch: pytest.MonkeyPatch, stages: str | None) -> None:
     names = imported(monkeypatch, stages)
     assert names[: len(preload.LIBRARIES)] == list(preload.LIBRARIES)
-    assert {"pipeline.stages.design", "pipeline.models.static.fuzzy_means", "pipeline.laws.pid.pid"} <= set(names)
+    assert {
+        "loopwright.pipeline.stages.design",
+        "loopwright.pipeline.models.static.fuzzy_means",
+        "loopwright.pipeline.laws.pid.pid",
+    } <= set(names)
 
 
 def test_a_worker_for_models_alone_imports_no_exporter(monkeypatch: pytest.MonkeyPatch) -> None:
     libraries = ["casadi", "pandas", "pyarrow.parquet", "matplotlib.figure", "torch"]
-    assert imported(monkeypatch, "screen,fit,overview") == [*libraries, "pipeline.stages.fit"]
-    assert imported(monkeypatch, "excite") == [*libraries[:3], "pipeline.stages.excite"]
+    assert imported(monkeypatch, "screen,fit,overview") == [*libraries, "loopwright.pipeline.stages.fit"]
+    assert imported(monkeypatch, "excite") == [*libraries[:3], "loopwright.pipeline.stages.excite"]
     assert imported(monkeypatch, "screen") == []
 
 
 def test_a_worker_for_controllers_imports_the_exporter_where_they_are_designed(monkeypatch: pytest.MonkeyPatch) -> None:
     tried, designed = imported(monkeypatch, "validate,report"), imported(monkeypatch, "validate,design")
-    assert tried == ["onnxruntime", "casadi", "pyarrow.parquet", "onnx", "pipeline.stages.validate"]
+    assert tried == ["onnxruntime", "casadi", "pyarrow.parquet", "onnx", "loopwright.pipeline.stages.validate"]
     assert {"torch", "torch.export._trace", "onnxscript.optimizer"} <= set(designed)
-    assert designed[-2:] == ["pipeline.stages.validate", "pipeline.stages.design"]
+    assert designed[-2:] == ["loopwright.pipeline.stages.validate", "loopwright.pipeline.stages.design"]
 
 
 def test_every_stage_that_needs_a_worker_is_known_to_need_something() -> None:

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from pipeline.engine import progress
-from pipeline.engine.parallel import parallel_map
-from pipeline.engine.progress import EVERY_S, Lines, Piece, steps, within
+from loopwright.pipeline.engine import progress
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.engine.progress import EVERY_S, Lines, Piece, steps, within
 
 
 class Clock:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.evaluation.stress.faults import SLOW, SPAN, STUCK, ZERO, Actuators, Fault, draw_fault
-from serving import Signal
+from loopwright.pipeline.evaluation.stress.faults import SLOW, SPAN, STUCK, ZERO, Actuators, Fault, draw_fault
+from loopwright.serving import Signal
 
 VALVE = (Signal("valve", "%", 0.0, 100.0),)
 

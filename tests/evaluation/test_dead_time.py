@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cases import CASES
-from pipeline.evaluation.dead_time import LONGEST, dead_times
-from pipeline.plants.simulator import Array, Simulator
-from serving.manifest import Signal
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.evaluation.dead_time import LONGEST, dead_times
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.serving.manifest import Signal
 
 
 class Delayed(Simulator):
@@ -49,7 +49,7 @@ def test_the_quickest_mv_counts_for_each_controlled_variable(
 
 
 def test_a_variable_that_never_answers_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.evaluation.dead_time.LONGEST", 5)
+    monkeypatch.setattr("loopwright.pipeline.evaluation.dead_time.LONGEST", 5)
     assert dead_times(Delayed(3, 9, 9)) == [3, None]
 
 

@@ -10,13 +10,22 @@ import numpy as np
 import pytest
 from shipped import required
 
-from pipeline.__main__ import main
-from pipeline.cases import PLANTS
-from pipeline.export.gate import export
-from pipeline.laws import LAWS
-from serving import Controller, ControlLoop, LoopError, Mode, Sample, SimulatedEndpoint, VirtualClock, default_guards
-from serving.bench import bench
-from serving.card import card
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws import LAWS
+from loopwright.serving import (
+    Controller,
+    ControlLoop,
+    LoopError,
+    Mode,
+    Sample,
+    SimulatedEndpoint,
+    VirtualClock,
+    default_guards,
+)
+from loopwright.serving.bench import bench
+from loopwright.serving.card import card
 
 CASE = "jacketed_batch_reactor"
 PV = np.array([30.0, 35.0])

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from own_cases import two_lags
 
-from pipeline.cases import CASES
-from pipeline.evaluation.grounds import Grounds, RecordVerdict
-from pipeline.evaluation.reached import beyond, grounds_of, reached_by, widest
-from pipeline.simulation.simulate import simulate_closed
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.evaluation.grounds import Grounds, RecordVerdict
+from loopwright.pipeline.evaluation.reached import beyond, grounds_of, reached_by, widest
+from loopwright.pipeline.simulation.simulate import simulate_closed
 
 RECORDED = {"T": (20.0, 60.0), "V": (0.0, 10.0)}
 

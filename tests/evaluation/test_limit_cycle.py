@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from own_cases import controllers_of_a_lag
 
-from pipeline.cases.own_plant import OwnCase
-from pipeline.evaluation.closed_loop import RANGE_BAND, STEP_BAND
-from pipeline.evaluation.law_evidence import Cycle
-from pipeline.evaluation.limit_cycle import MV_SWING, NOISES, cycle_of
-from pipeline.evaluation.trial import swings_on
-from pipeline.simulation.simulate import Trajectory, simulate_closed
+from loopwright.pipeline.cases.own_plant import OwnCase
+from loopwright.pipeline.evaluation.closed_loop import RANGE_BAND, STEP_BAND
+from loopwright.pipeline.evaluation.law_evidence import Cycle
+from loopwright.pipeline.evaluation.limit_cycle import MV_SWING, NOISES, cycle_of
+from loopwright.pipeline.evaluation.trial import swings_on
+from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
 
 PERIOD = 8  # samples of a swing
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from own_cases import filled_level
 
-from pipeline.cases import CASES
-from pipeline.cases.own_plant import OwnCase
-from pipeline.evaluation.closed_loop import LEFT, left_limits, locked_up
-from pipeline.evaluation.trial import close_loop, repeated, seized
-from serving.controller import Controller
-from serving.errors import LoopwrightError
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.own_plant import OwnCase
+from loopwright.pipeline.evaluation.closed_loop import LEFT, left_limits, locked_up
+from loopwright.pipeline.evaluation.trial import close_loop, repeated, seized
+from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopwrightError
 
 Law = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 

@@ -11,12 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from whole_bounds import whole_bounds
 
-from pipeline.cases import CASES
-from pipeline.errors import ParamsError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.metric import METRICS, REDUCE, Metric, gate_ratio, mean_of_draws, ratio_to_bound, together
-from pipeline.optimal.bounds import bounded, kinds, read_stored
-from pipeline.optimal.bounds import bounds_path as path_of
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.metric import (
+    METRICS,
+    REDUCE,
+    Metric,
+    gate_ratio,
+    mean_of_draws,
+    ratio_to_bound,
+    together,
+)
+from loopwright.pipeline.optimal.bounds import bounded, kinds, read_stored
+from loopwright.pipeline.optimal.bounds import bounds_path as path_of
 
 OWN = {metric.name: metric for metric in (Metric("overshoot_max", "largest overshoot", together="max"),)}
 POSITIVE = st.floats(1e-6, 1e3)

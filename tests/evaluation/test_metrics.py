@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from pipeline import metrics
-from pipeline.evaluation import closed_loop
-from pipeline.evaluation.closed_loop import closed_loop_metrics, locked_up
-from pipeline.evaluation.metric import METRICS
+from loopwright.pipeline import metrics
+from loopwright.pipeline.evaluation import closed_loop
+from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics, locked_up
+from loopwright.pipeline.evaluation.metric import METRICS
 
 KEYS = {m.name for m in METRICS.values() if m.of} | {"ise", "masse", "max_asse", "overshoot", "settling", "mv_travel"}
 SIGNAL = npst.arrays(np.float64, 40, elements=st.floats(-1e3, 1e3))

@@ -11,16 +11,16 @@ import pytest
 from own_cases import controllers_of_a_lag, two_lags
 from rich.console import Console
 
-from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.proof import fit_doubts, sign_doubts, statements
-from pipeline.evaluation.reached import grounds_of
-from pipeline.evaluation.validation import Validation
-from pipeline.report.results import show_results
-from pipeline.stages.design import design
-from pipeline.stages.report import report
-from pipeline.stages.validate import validate
-from pipeline.tracking.gate import Gate
-from serving import Controller
+from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, statements
+from loopwright.pipeline.evaluation.reached import grounds_of
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.report.results import show_results
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.report import report
+from loopwright.pipeline.stages.validate import validate
+from loopwright.pipeline.tracking.gate import Gate
+from loopwright.serving import Controller
 
 ANSWER: dict[str, Any] = {
     "model": 2.0, "low": 1.8, "high": 2.2, "first": 5, "last": 9, "direct": 1.9, "sd": 0.2, "halves": [8.0, 7.0],

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.evaluation.one_side import before_turns, on_one_side, side_of
-from pipeline.plants.signals import Signals
-from serving.manifest import Signal
+from loopwright.pipeline.evaluation.one_side import before_turns, on_one_side, side_of
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving.manifest import Signal
 
 PV, MV = Signal("y", "K", 0.0, 100.0), Signal("u", "%", 0.0, 100.0)
 ONE = Signals(10.0, (PV,), (PV,), (), (MV,))

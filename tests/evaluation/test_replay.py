@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.errors import RecordError
-from pipeline.evaluation.replay import UNSEEN, replay
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record
-from serving.errors import LoopwrightError
-from serving.manifest import Signal
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.evaluation.replay import UNSEEN, replay
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.manifest import Signal
 
 Y, U = Signal("y", "m", 0.0, 10.0), Signal("u", "V", -1.0, 1.0)
 SIGNALS = Signals(2.0, (Y,), (Y,), (), (U,))

@@ -12,21 +12,21 @@ import pytest
 from identified_models import made_signals, random_model
 from own_cases import controllers_of_a_lag
 
-from pipeline.cases import CASES
-from pipeline.cases.own_plant import OwnCase
-from pipeline.commands.stress import outcomes_of
-from pipeline.engine.cluster import connected, local_cluster
-from pipeline.errors import PlantError
-from pipeline.evaluation.stress.draws import LATE, NOISE, Draw, Drawing
-from pipeline.evaluation.stress.faults import KINDS, Actuators
-from pipeline.evaluation.stress.loops import Stress, swings
-from pipeline.evaluation.stress.summary import Summary, table
-from pipeline.export.gate import export
-from pipeline.laws import LAWS
-from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from pipeline.plants.side_by_side import advance_rows
-from pipeline.plants.simulator import Simulator
-from serving import Controller, LoopwrightError, Signal
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.own_plant import OwnCase
+from loopwright.pipeline.commands.stress import outcomes_of
+from loopwright.pipeline.engine.cluster import connected, local_cluster
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.stress.draws import LATE, NOISE, Draw, Drawing
+from loopwright.pipeline.evaluation.stress.faults import KINDS, Actuators
+from loopwright.pipeline.evaluation.stress.loops import Stress, swings
+from loopwright.pipeline.evaluation.stress.summary import Summary, table
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from loopwright.pipeline.plants.side_by_side import advance_rows
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.serving import Controller, LoopwrightError, Signal
 
 ROOT = Path(__file__).parents[2]
 PH = ROOT / "artifacts/ph_neutralization/pid.onnx"
@@ -208,8 +208,8 @@ def test_rows_of_an_identified_plant_are_its_steps(n_hidden: int) -> None:
 def test_two_workers_find_what_one_process_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loops of an own plant on real processes, which see nothing of its files."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{ROOT / 'tests'}")
-    monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])  # which takes each worker seconds
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}/tools/roots{os.pathsep}{ROOT / 'tests'}")
+    monkeypatch.setattr("loopwright.pipeline.engine.cluster.PRELOAD", [])  # which takes each worker seconds
     own = own_stress(tmp_path)
     alone = outcomes_of(own, 40, workers=1)
     with local_cluster(2) as at:

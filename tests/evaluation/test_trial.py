@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cases import CASES
-from pipeline.evaluation import trial, trials
-from pipeline.evaluation.case import Case, Curve, Figure
-from pipeline.evaluation.trial import DRAW, close_loop, repeated, seized, swings_on
-from pipeline.evaluation.trials import try_files
-from serving.errors import OutputError
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.evaluation import trial, trials
+from loopwright.pipeline.evaluation.case import Case, Curve, Figure
+from loopwright.pipeline.evaluation.trial import DRAW, close_loop, repeated, seized, swings_on
+from loopwright.pipeline.evaluation.trials import try_files
+from loopwright.serving.errors import OutputError
 
 
 @dataclass

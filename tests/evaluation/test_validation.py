@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from pipeline.errors import PipelineError
-from pipeline.evaluation.law_evidence import Analysis, lock_up_text
-from pipeline.evaluation.standing import Standing
-from pipeline.evaluation.validation import (
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.evaluation.law_evidence import Analysis, lock_up_text
+from loopwright.pipeline.evaluation.standing import Standing
+from loopwright.pipeline.evaluation.validation import (
     FILE,
     SCHEMA,
     GateRecord,
@@ -24,8 +24,8 @@ from pipeline.evaluation.validation import (
     Titles,
     Validation,
 )
-from pipeline.tracking.card import model_description, version_description
-from pipeline.tracking.gate import Gate
+from loopwright.pipeline.tracking.card import model_description, version_description
+from loopwright.pipeline.tracking.gate import Gate
 
 LOCKED = {"steps": {"0": 2, "3": 1}, "held_out_noise": {"1": 1}}
 

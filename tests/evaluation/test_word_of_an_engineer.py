@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 from own_cases import controllers_of_a_lag
 
-from pipeline.evaluation.known import known_rows, question
-from pipeline.evaluation.proof import sign_doubts, statements
-from pipeline.evaluation.validation import Validation
-from pipeline.stages.design import design
-from pipeline.stages.report import report
-from pipeline.stages.validate import validate
+from loopwright.pipeline.evaluation.known import known_rows, question
+from loopwright.pipeline.evaluation.proof import sign_doubts, statements
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.report import report
+from loopwright.pipeline.stages.validate import validate
 
 ANSWER: dict[str, Any] = {
     "model": 2.0, "low": -0.2, "high": 2.2, "first": 5, "last": 9, "direct": 1.0, "sd": 1.0, "halves": [1.0, 0.5],
@@ -92,7 +92,7 @@ def test_nothing_is_shipped_before_a_question_is_answered(
     case = controllers_of_a_lag({"pid": {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 4.0}})
     if simulator:
         monkeypatch.setattr(type(case), "stand_in", "simulator", raising=False)
-        monkeypatch.setattr("pipeline.cases.own_plant.OwnCase.stand_in", "simulator", raising=False)
+        monkeypatch.setattr("loopwright.pipeline.cases.own_plant.OwnCase.stand_in", "simulator", raising=False)
     (case.models.parent / "metrics.json").write_text(json.dumps(models(ASKED, verdict="proven")))
     for stage in (design, validate):
         stage("it-pid")

@@ -8,21 +8,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_up_plant import Lag, Mixer
 
-from pipeline.cases import CASES, beside
-from pipeline.cases.batch_reactor.plant import BatchReactor
-from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.config.params import parse
-from pipeline.errors import ParamsError, PlantError
-from pipeline.excitation import EXCITATIONS as GENERAL
-from pipeline.excitation import Excitation, OpenLoop
-from pipeline.excitation.batches import Batches
-from pipeline.excitation.operating_point import OperatingPoint
-from pipeline.excitation.sequences import TAPS, Aprbs, Multisine, Prbs, RandomSteps, maximal_length
-from pipeline.models.training.regressors import forward_pairs, inverse_pairs
-from pipeline.records.record import Record
-from pipeline.simulation.simulate import simulate_open
-from serving.manifest import Signal
+from loopwright.pipeline.cases import CASES, beside
+from loopwright.pipeline.cases.batch_reactor.plant import BatchReactor
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import ParamsError, PlantError
+from loopwright.pipeline.excitation import EXCITATIONS as GENERAL
+from loopwright.pipeline.excitation import Excitation, OpenLoop
+from loopwright.pipeline.excitation.batches import Batches
+from loopwright.pipeline.excitation.operating_point import OperatingPoint
+from loopwright.pipeline.excitation.sequences import TAPS, Aprbs, Multisine, Prbs, RandomSteps, maximal_length
+from loopwright.pipeline.models.training.regressors import forward_pairs, inverse_pairs
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.simulate import simulate_open
+from loopwright.serving.manifest import Signal
 
 # Every kind of excitation, those that only one case has among them.
 EXCITATIONS: dict[str, type[Excitation]] = dict(GENERAL)

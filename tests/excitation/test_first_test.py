@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.errors import PlantError
-from pipeline.excitation.first_test import first_test
-from pipeline.plants.simulator_file import FileSimulator
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.excitation.first_test import first_test
+from loopwright.pipeline.plants.simulator_file import FileSimulator
 
 FILE = """
 class Plant:

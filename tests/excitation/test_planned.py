@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import PlantError
-from pipeline.excitation.first_test import first_test
-from pipeline.excitation.planned import excited, planned
-from pipeline.plants.simulator_file import FileSimulator
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.excitation.first_test import first_test
+from loopwright.pipeline.excitation.planned import excited, planned
+from loopwright.pipeline.plants.simulator_file import FileSimulator
 
 LAG = """
 class Lag:

@@ -15,16 +15,16 @@ import torch
 from quick_laws import STEPS_OF_GATE
 from torch import Tensor
 
-from pipeline.errors import ExportError
-from pipeline.export import gate
-from pipeline.export.controller_file import with_evidence
-from pipeline.export.gate import GATE_TOLERANCE, export, parity_gate
-from pipeline.export.graph import law_graph
-from pipeline.laws import ControlLaw
-from pipeline.plants.signals import Signals
-from serving import Controller, Signal
-from serving.conformance.steps import answered
-from serving.digest import TRAILER_BYTES, file_digest
+from loopwright.pipeline.errors import ExportError
+from loopwright.pipeline.export import gate
+from loopwright.pipeline.export.controller_file import with_evidence
+from loopwright.pipeline.export.gate import GATE_TOLERANCE, export, parity_gate
+from loopwright.pipeline.export.graph import law_graph
+from loopwright.pipeline.laws import ControlLaw
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving import Controller, Signal
+from loopwright.serving.conformance.steps import answered
+from loopwright.serving.digest import TRAILER_BYTES, file_digest
 
 pytest_plugins = ["small_laws"]
 MakeFormula = Callable[..., ControlLaw]

@@ -18,12 +18,12 @@ from onnx import numpy_helper
 from onnx_graphs import Nodes, assert_equal, graph, n_nodes, narrow, results, session
 from shipped_files import SHIPPED
 
-from pipeline.export import fusion
-from pipeline.export.fusion import emission, fused, reading
-from pipeline.export.fusion.affine import Affine
-from pipeline.export.fusion.plan import Choice, Item
-from pipeline.export.fusion.pools import Group, Selection
-from pipeline.export.fusion.reading import Reading
+from loopwright.pipeline.export import fusion
+from loopwright.pipeline.export.fusion import emission, fused, reading
+from loopwright.pipeline.export.fusion.affine import Affine
+from loopwright.pipeline.export.fusion.plan import Choice, Item
+from loopwright.pipeline.export.fusion.pools import Group, Selection
+from loopwright.pipeline.export.fusion.reading import Reading
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 WITHOUT_QP = [p for p in SHIPPED if p.stem != "predictive"]
@@ -168,7 +168,7 @@ def test_what_cancels_does_not_depend_on_what_it_is_part_of(monkeypatch: pytest.
     )
     assert not cyclic(model)
     assert_equal(model, fused(model))
-    monkeypatch.setattr("pipeline.export.fusion.forms._before", lambda operand, value: True)
+    monkeypatch.setattr("loopwright.pipeline.export.fusion.forms._before", lambda operand, value: True)
     assert cyclic(model)
 
 
@@ -434,7 +434,7 @@ def test_the_same_graph_gives_the_same_bytes() -> None:
     """In any process: no order comes from an address or a seed of hashing."""
     path = next(p for p in WITHOUT_QP if p.stem == "gauss_newton_pid")
     code = (
-        "import hashlib, onnx, sys; from pipeline.export.fusion import fused; "
+        "import hashlib, onnx, sys; from loopwright.pipeline.export.fusion import fused; "
         "print(hashlib.sha256(fused(onnx.load(sys.argv[1])).SerializeToString()).hexdigest())"
     )
     seen = set()

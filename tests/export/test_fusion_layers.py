@@ -9,8 +9,8 @@ import numpy as np
 import onnx
 from onnx_graphs import Nodes, assert_equal, graph, n_nodes
 
-from pipeline.export.fusion import fused
-from pipeline.export.fusion.joining import joined
+from loopwright.pipeline.export.fusion import fused
+from loopwright.pipeline.export.fusion.joining import joined
 
 RNG = np.random.default_rng(0)
 

@@ -12,14 +12,14 @@ import onnx
 import onnxruntime as ort
 import pytest
 
-from pipeline.cases import CASES, PLANTS
-from pipeline.errors import ExportError
-from pipeline.export import plant_graphs as module
-from pipeline.export.casadi_graph import casadi_graph
-from pipeline.export.plant_graphs import plant_graphs
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.cases import CASES, PLANTS
+from loopwright.pipeline.errors import ExportError
+from loopwright.pipeline.export import plant_graphs as module
+from loopwright.pipeline.export.casadi_graph import casadi_graph
+from loopwright.pipeline.export.plant_graphs import plant_graphs
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 RUNS = 200
 EQUATIONS = sorted(name for name, plant in PLANTS.items() if issubclass(plant, EquationPlant))

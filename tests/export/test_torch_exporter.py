@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from pipeline.export import graph, torch_exporter
-from pipeline.export.graph import law_graph
-from pipeline.laws import ControlLaw
+from loopwright.pipeline.export import graph, torch_exporter
+from loopwright.pipeline.export.graph import law_graph
+from loopwright.pipeline.laws import ControlLaw
 
 pytest_plugins = ["small_laws"]
 Make = Callable[..., ControlLaw]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from dirty_plant import PERIOD_S, TAGS, Clean, cells, clean, screen, screen_of, write
 
-from pipeline.errors import RecordError
-from pipeline.historian.reason import Reason
-from pipeline.historian.screening import Screened
-from pipeline.historian.tags import Tag
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.tags import Tag
 
 SEED = np.random.default_rng(5)
 SPOT = SEED.choice(np.arange(60, 1440), 20, replace=False)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from dirty_plant import TAGS, clean, screen_of, spoilt
 
-from pipeline.historian.few_levels import on_off
-from pipeline.historian.refusal import refusal
-from pipeline.historian.screening import Screened
-from pipeline.historian.tags import Tag, named
-from pipeline.records.levels import levels_of, only_between
+from loopwright.pipeline.historian.few_levels import on_off
+from loopwright.pipeline.historian.refusal import refusal
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.tags import Tag, named
+from loopwright.pipeline.records.levels import levels_of, only_between
 
 PV, MV, DV = TAGS
 PERCENT = (PV, replace(MV, low=0.0, high=100.0), DV)

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import RecordError
-from pipeline.historian import grid as grid_module
-from pipeline.historian.export import Series
-from pipeline.historian.grid import resampled
-from pipeline.historian.reason import Reason
-from pipeline.historian.sampling import proposed_period, sampling
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian import grid as grid_module
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.grid import resampled
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.sampling import proposed_period, sampling
 
 
 def series(tag: str, t: np.ndarray, v: np.ndarray) -> Series:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from dirty_plant import Clean, screen_of, steps
 
-from pipeline.commands.new_printed import sayings
-from pipeline.historian.screening import Screened
-from pipeline.historian.tags import Tag
+from loopwright.pipeline.commands.new_printed import sayings
+from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.tags import Tag
 
 RATE = 0.02  # a row, of the level by the valve
 PERIOD_S = 10.0

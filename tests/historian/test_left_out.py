@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, cells, clean, screen, screen_of, steps, write
 
-from pipeline.config.exports import ExportParams
-from pipeline.config.intervals import Interval
-from pipeline.errors import RecordError
-from pipeline.historian.reason import Reason
-from pipeline.historian.screening import Screened
+from loopwright.pipeline.config.exports import ExportParams
+from loopwright.pipeline.config.intervals import Interval
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.screening import Screened
 
 DATES = "2024-03-04T06:10:00..2024-03-04T06:20:00"  # minutes 10 to 20 of the record
 

@@ -12,10 +12,10 @@ from dirty_plant import cells, clean, screen, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import RecordError
-from pipeline.historian.dialect import sniff
-from pipeline.historian.numbers import loose_number, numbers
-from pipeline.historian.reading import read_export
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.dialect import sniff
+from loopwright.pipeline.historian.numbers import loose_number, numbers
+from loopwright.pipeline.historian.reading import read_export
 
 MINUSES = ["-", "\u2212", "\u2013", "\u2010", "\u2011", "\ufe63", "\uff0d", "\u2212\u00a0", "- "]
 THOUSANDS = ["", "\u00a0", "\u202f", "\u2009", " ", "'", "’"]

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipeline.historian.grid import Grid
-from pipeline.historian.old_controller import old_controllers
-from pipeline.historian.tags import Tag
-from pipeline.records.old_controller import OldController
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.old_controller import old_controllers
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.records.old_controller import OldController
 
 H = 10.0  # s
 TAGS = (

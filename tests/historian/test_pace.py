@@ -13,13 +13,13 @@ from dirty_plant import clean, screen_of, write
 from scipy.signal import lfilter
 from undrawn import draw_nothing
 
-from pipeline.__main__ import main
-from pipeline.config.exports import ExportParams, screened_record
-from pipeline.historian.excerpt import SEEN
-from pipeline.historian.export import Series
-from pipeline.historian.pace import FINE, MOST_PERIODS, Answer, Pace, _settling, in_words, of_period, pace_of
-from pipeline.historian.tags import Tag
-from pipeline.stages.screen import screen
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.config.exports import ExportParams, screened_record
+from loopwright.pipeline.historian.excerpt import SEEN
+from loopwright.pipeline.historian.export import Series
+from loopwright.pipeline.historian.pace import FINE, MOST_PERIODS, Answer, Pace, _settling, in_words, of_period, pace_of
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.stages.screen import screen
 
 START_S = 1_709_532_000.0
 

@@ -15,11 +15,11 @@ from dirty_plant import START_S, TAGS, cells, clean, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import RecordError
-from pipeline.historian.dialect import sniff
-from pipeline.historian.numbers import numbers
-from pipeline.historian.reading import read_export, units_of
-from pipeline.historian.reason import Reason
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.dialect import sniff
+from loopwright.pipeline.historian.numbers import numbers
+from loopwright.pipeline.historian.reading import read_export, units_of
+from loopwright.pipeline.historian.reason import Reason
 
 N = 60
 DATA = clean(N)

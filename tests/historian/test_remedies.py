@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from dirty_plant import TAGS, cells, clean, screen, screen_of, write
 
-from pipeline.errors import RecordError
-from pipeline.historian.guessing import guesses
-from pipeline.historian.reading import read_export
-from pipeline.historian.screening import Screened, screened
-from pipeline.historian.tags import Tag, named, write_tags
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.guessing import guesses
+from loopwright.pipeline.historian.reading import read_export
+from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.tags import Tag, named, write_tags
 
 HEADER = ("timestamp", *(t.tag for t in TAGS))
 MODES = (Tag("A.MODE", "mode"), Tag("B.MODE", "mode"))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from dirty_plant import TAGS, clean, screen_of, spoilt
 
-from pipeline.historian.character import clipped
-from pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.character import clipped
+from loopwright.pipeline.historian.screening import Screened
 
 PV, MV, DV = TAGS
 

@@ -10,15 +10,15 @@ import pytest
 from dirty_plant import PERIOD_S, START_S, Clean, clean, screen_of
 from scipy.signal import lfilter
 
-from pipeline.commands.new_printed import sayings
-from pipeline.config.known import Known
-from pipeline.historian import settled
-from pipeline.historian.findings import Finding, InputReport
-from pipeline.historian.loads import load_sd
-from pipeline.historian.screening import spelt
-from pipeline.historian.settled import certain, step_answers
-from pipeline.historian.step_test import GUESSED_H, LARGEST, LONGEST_H, MOST, UNKNOWN_PERIODS, planned
-from pipeline.historian.tags import Tag
+from loopwright.pipeline.commands.new_printed import sayings
+from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.historian import settled
+from loopwright.pipeline.historian.findings import Finding, InputReport
+from loopwright.pipeline.historian.loads import load_sd
+from loopwright.pipeline.historian.screening import spelt
+from loopwright.pipeline.historian.settled import certain, step_answers
+from loopwright.pipeline.historian.step_test import GUESSED_H, LARGEST, LONGEST_H, MOST, UNKNOWN_PERIODS, planned
+from loopwright.pipeline.historian.tags import Tag
 
 LOAD_SD, LAG, DEAD = 4.0, 20, 7
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from dirty_plant import TAGS, answer, clean, screen_of
 
-from pipeline.errors import RecordError
-from pipeline.historian.exported import exported, signal_tags
-from pipeline.historian.missing_codes import sentinels
-from pipeline.historian.tags import Tag, named, read_tags
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.exported import exported, signal_tags
+from loopwright.pipeline.historian.missing_codes import sentinels
+from loopwright.pipeline.historian.tags import Tag, named, read_tags
 
 CERTAIN = tuple(replace(tag, unit_certain=True) for tag in TAGS)
 

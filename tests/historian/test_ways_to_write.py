@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 import pytest
 from dirty_plant import TAGS, cells, clean, write
 
-from pipeline.errors import RecordError
-from pipeline.historian.reading import read_export, tags_in, units_of
-from pipeline.historian.tags import parse_tag
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.reading import read_export, tags_in, units_of
+from loopwright.pipeline.historian.tags import parse_tag
 
 N = 60
 DATA = clean(N)

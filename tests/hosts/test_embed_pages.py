@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 from kits import EMBED, ROOT, SHIPPED, kit_of
 
-from serving import Controller
-from serving.conformance.kit import VECTORS
-from serving.graph_audit import audit
+from loopwright.serving import Controller
+from loopwright.serving.conformance.kit import VECTORS
+from loopwright.serving.graph_audit import audit
 
 PLC = (EMBED / "plc" / "README.md").read_text()
 DOCS = (ROOT / "docs" / "embedding.md").read_text()

@@ -12,12 +12,12 @@ import pytest
 from controller_fmus import MISSING, file_of
 from kits import ROOT
 
-from pipeline.__main__ import main
-from pipeline.commands import Parser
-from pipeline.commands.fmu import options
-from pipeline.hosts.fmu.compiling import HEADER, HOSTS, SHIPPED, SHIPPED_SHA256, SOURCES
-from pipeline.hosts.fmu.variables import variables_of
-from serving import Controller
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.commands import Parser
+from loopwright.pipeline.commands.fmu import options
+from loopwright.pipeline.hosts.fmu.compiling import HEADER, HOSTS, SHIPPED, SHIPPED_SHA256, SOURCES
+from loopwright.pipeline.hosts.fmu.variables import variables_of
+from loopwright.serving import Controller
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)
@@ -101,7 +101,7 @@ def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         here.setattr(sys, "platform", "win32")
         assert "an FMU is built on Linux" in refused(capsys, *words)
     with monkeypatch.context() as here:
-        here.setattr("pipeline.hosts.fmu.compiling._library", lambda: Path("/x/libonnxruntime.so.1.20.1"))
+        here.setattr("loopwright.pipeline.hosts.fmu.compiling._library", lambda: Path("/x/libonnxruntime.so.1.20.1"))
         told = refused(capsys, *words)
         assert "onnxruntime here is 1.20, older than its header of 1.21; pip install 'onnxruntime>=1.21'" in told
     with monkeypatch.context() as here:
@@ -135,7 +135,9 @@ def test_the_page_names_every_option_and_variable() -> None:
 
 def test_the_package_ships_what_is_compiled() -> None:
     """The globs of package data name every file that the command reads."""
-    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["pipeline"]
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"][
+        "loopwright.pipeline"
+    ]
     shipped = {path for glob in data for path in (ROOT / "pipeline").glob(glob)}
     assert {HOSTS / "c" / "host.c", *SHIPPED.iterdir(), *SOURCES.iterdir()} <= shipped
     assert {path.name for path in SHIPPED.iterdir()} == {HEADER, "LICENSE"}

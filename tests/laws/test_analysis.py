@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.cases import PLANTS
-from pipeline.config.params import ControllerParams
-from pipeline.evaluation.law_evidence import Analysis as Said
-from pipeline.evaluation.law_evidence import Form, LawEvidence, LawMetrics
-from pipeline.laws.base import Analysis
-from pipeline.stages.design import _analysed
-from pipeline.stages.paths import analysis_file
-from pipeline.stages.validate import _keep_analysis
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.config.params import ControllerParams
+from loopwright.pipeline.evaluation.law_evidence import Analysis as Said
+from loopwright.pipeline.evaluation.law_evidence import Form, LawEvidence, LawMetrics
+from loopwright.pipeline.laws.base import Analysis
+from loopwright.pipeline.stages.design import _analysed
+from loopwright.pipeline.stages.paths import analysis_file
+from loopwright.pipeline.stages.validate import _keep_analysis
 
 PLANT = PLANTS["batch_reactor"]()
 PARAMS = ControllerParams(

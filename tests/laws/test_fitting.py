@@ -9,11 +9,11 @@ import pytest
 from identified_models import first_order, made_signals
 from quick_laws import plant_of
 
-from pipeline.errors import LawError
-from pipeline.laws import LAWS
-from pipeline.laws.fitting import require_fit
-from pipeline.models import Model
-from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.laws.fitting import require_fit
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 
 
 def plant(model: Model, n: int = 1, **more: np.ndarray) -> IdentifiedPlant:

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from shipped import required
 from torch import Tensor
 
-from pipeline.cases import CASES, PLANTS
-from pipeline.config.params import parse
-from pipeline.errors import LawError, ParamsError
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw
-from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.cases import CASES, PLANTS
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import LawError, ParamsError
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
 
 CASE = CASES["jacketed_batch_reactor"]
 PLANT = CASE.plant

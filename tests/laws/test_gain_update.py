@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from pipeline.laws.gain_update import LONGEST, PidForm, gain_update
+from loopwright.pipeline.laws.gain_update import LONGEST, PidForm, gain_update
 
 LO, HI = np.array([0.0, 0.0, 0.0]), np.array([5.0, 2.0, 8.0])
 W = np.array([1.0, 0.3, 2.0])

@@ -10,11 +10,11 @@ import torch
 from shipped import required
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.inverse.inverse import INC, INCAD, INCADEC
-from pipeline.models import Model
-from pipeline.models.static.leverage_domain import LeverageDomain
-from pipeline.plants.signals import Signals
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.inverse.inverse import INC, INCAD, INCADEC
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.static.leverage_domain import LeverageDomain
+from loopwright.pipeline.plants.signals import Signals
 
 DV = torch.zeros(0, dtype=torch.float64)
 A, B, MIDDLE = 0.8, -1e-3, 250.0  # y(k+1) = A y(k) + B (mv(k) - MIDDLE) + disturbance; the second PV takes no part

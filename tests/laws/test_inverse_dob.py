@@ -8,12 +8,12 @@ import torch
 from shipped import required
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob, ObserverLaw
-from pipeline.models.base import Model
-from pipeline.models.static.candidates import candidates
-from pipeline.plants.signals import Signals
-from serving.manifest import Signal
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob, ObserverLaw
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.static.candidates import candidates
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving.manifest import Signal
 
 PERIOD = 0.5
 SIGNALS = Signals(

@@ -14,13 +14,13 @@ from quick_laws import QUICK, plant_of, quick_parts, rest_points
 from shipped import required
 from torch import Tensor
 
-from pipeline.config.params import parse
-from pipeline.errors import LawError
-from pipeline.export.gate import export
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.laws.reference.reference_law import ReferenceLaw
-from pipeline.plants.equations import EquationPlant
-from serving import Controller
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.laws.reference.reference_law import ReferenceLaw
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.serving import Controller
 
 # A law is the same for all examples: nothing of it changes from one to the next.
 # An example of the range is 8 steps of 16 rows, one of the rows 2 steps of 4.

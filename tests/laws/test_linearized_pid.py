@@ -8,18 +8,18 @@ import torch
 from nnarx_loops import closed, designed, info, sse, trained
 from scipy.stats import chi2
 
-from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
-from pipeline.config.params import parse
-from pipeline.errors import ParamsError
-from pipeline.excitation import EXCITATIONS
-from pipeline.export.fusion import fused
-from pipeline.export.graph import law_graph
-from pipeline.laws.base import ControlLaw
-from pipeline.laws.gain_update import gain_update
-from pipeline.laws.linearized.linearized_pid import LinearizedPid
-from pipeline.laws.ranges import in_units
-from pipeline.models.lagged.instantaneous import linearize
-from pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.excitation import EXCITATIONS
+from loopwright.pipeline.export.fusion import fused
+from loopwright.pipeline.export.graph import law_graph
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.laws.gain_update import gain_update
+from loopwright.pipeline.laws.linearized.linearized_pid import LinearizedPid
+from loopwright.pipeline.laws.ranges import in_units
+from loopwright.pipeline.models.lagged.instantaneous import linearize
+from loopwright.pipeline.models.lagged.nnarx import NNARX
 
 PH = PhNeutralizationCase()
 UNIT = 100.0  # [ml/min] half the range of the base flow

@@ -10,17 +10,17 @@ import torch
 from henson_seborg_cstr_parts import local_models
 from shipped import required
 
-from pipeline.cases import CASES
-from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
-from pipeline.config.params import parse
-from pipeline.errors import LawError, ParamsError
-from pipeline.laws import LAWS
-from pipeline.laws.local.local_controllers import LocalControllers
-from pipeline.laws.local.local_stability import StabilityTest
-from pipeline.laws.local.pid_networks import one_knob
-from pipeline.plants.linearization import Linearization
-from pipeline.tuning.rules import PidSettings, sampled_loop
-from pipeline.tuning.stability import FrozenLoops, spectral_radius
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import LawError, ParamsError
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.laws.local.local_controllers import LocalControllers
+from loopwright.pipeline.laws.local.local_stability import StabilityTest
+from loopwright.pipeline.laws.local.pid_networks import one_knob
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.tuning.rules import PidSettings, sampled_loop
+from loopwright.pipeline.tuning.stability import FrozenLoops, spectral_radius
 
 CASE = CASES["henson_seborg_cstr"]
 TESTS = ("up", "down", "jump")

@@ -7,15 +7,15 @@ import pytest
 import torch
 from nnarx_loops import closed, designed, info, mirrored, mirrored_in_mv, negated_in_pv, negated_signals, sse, trained
 
-from pipeline.cases.batch_reactor.case import BatchReactorCase
-from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
-from pipeline.config.params import parse
-from pipeline.errors import LawError, ParamsError
-from pipeline.excitation import EXCITATIONS
-from pipeline.laws import LAWS as ALL
-from pipeline.laws.base import ControlLaw
-from pipeline.models.lagged.next_output import Ahead, GaussNewton, NextOutput
-from pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.cases.batch_reactor.case import BatchReactorCase
+from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import LawError, ParamsError
+from loopwright.pipeline.excitation import EXCITATIONS
+from loopwright.pipeline.laws import LAWS as ALL
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.models.lagged.next_output import Ahead, GaussNewton, NextOutput
+from loopwright.pipeline.models.lagged.nnarx import NNARX
 
 PH = PhNeutralizationCase()
 BATCH = BatchReactorCase()

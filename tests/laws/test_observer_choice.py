@@ -11,15 +11,15 @@ import torch
 from identified_models import first_order, made_signals, scaled_model
 from shipped import required
 
-from pipeline.errors import LawError
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.laws.fitting import require_fit
-from pipeline.laws.inverse.inverse_dob import ObserverLaw
-from pipeline.laws.inverse.self_chosen import CALM, CLEAR, Choice, linearized
-from pipeline.models.identified.identified import Identified
-from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from pipeline.plants.signals import Signals
-from serving.manifest import Signal
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.laws.fitting import require_fit
+from loopwright.pipeline.laws.inverse.inverse_dob import ObserverLaw
+from loopwright.pipeline.laws.inverse.self_chosen import CALM, CLEAR, Choice, linearized
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving.manifest import Signal
 
 NAMES = ["inverse_dob", "forward_dob"]
 LEVEL, JACKET = Signal("y", "m", -3.0, 3.0), Signal("jacket", "K", -2.0, 2.0)

@@ -11,17 +11,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from made_up_plant import Chain, Lag
 
-from pipeline.cases.batch_reactor.plant import BatchReactor
-from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
-from pipeline.cases.ph_neutralization.plant import PhNeutralization
-from pipeline.errors import LawError
-from pipeline.laws.pid.pid import PID
-from pipeline.models import Model
-from pipeline.models.local.linearized import Linearized as LinearizedModel
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.signals import Signals
-from pipeline.simulation.simulate import simulate_closed
-from pipeline.tuning.rules import AllPole, PidSettings, imc_pid, sampled_loop
+from loopwright.pipeline.cases.batch_reactor.plant import BatchReactor
+from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.pid.pid import PID
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.local.linearized import Linearized as LinearizedModel
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.simulate import simulate_closed
+from loopwright.pipeline.tuning.rules import AllPole, PidSettings, imc_pid, sampled_loop
 
 DV = torch.zeros(0, dtype=torch.float64)
 

@@ -14,12 +14,12 @@ from identified_models import first_order, made_signals, random_model, scaled_mo
 from predictive_loops import NONE, closed, law_of, row
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.export.gate import export
-from pipeline.laws.predictive.horizon import horizon_of
-from pipeline.laws.predictive.loads import Where, loads_of
-from pipeline.laws.predictive.moves import Moves
-from pipeline.laws.predictive.observer import (
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws.predictive.horizon import horizon_of
+from loopwright.pipeline.laws.predictive.loads import Where, loads_of
+from loopwright.pipeline.laws.predictive.moves import Moves
+from loopwright.pipeline.laws.predictive.observer import (
     BOOST,
     CALMING,
     FIRST_LOAD,
@@ -33,16 +33,16 @@ from pipeline.laws.predictive.observer import (
     Observer,
     load_variance,
 )
-from pipeline.laws.predictive.plan import Cost, Planner
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
-from pipeline.laws.predictive.side_by_side import side_by_side
-from pipeline.laws.predictive.trials import LOOPS, Outcome, Trials, _late
-from pipeline.laws.predictive.tuning import FORGETS, TRAVEL, Candidate, calmest, judged, searched, tuned
-from pipeline.models.identified.identified import Identified
-from pipeline.models.static.mlp import MLP
-from serving import Controller
-from serving.manifest import Signal
+from loopwright.pipeline.laws.predictive.plan import Cost, Planner
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
+from loopwright.pipeline.laws.predictive.side_by_side import side_by_side
+from loopwright.pipeline.laws.predictive.trials import LOOPS, Outcome, Trials, _late
+from loopwright.pipeline.laws.predictive.tuning import FORGETS, TRAVEL, Candidate, calmest, judged, searched, tuned
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.serving import Controller
+from loopwright.serving.manifest import Signal
 
 few = settings(max_examples=8, deadline=None)
 seeds = st.integers(0, 2**16)

@@ -10,17 +10,17 @@ from identified_models import TOP, first_order, made_signals, random_model, scal
 from predictive_loops import closed, law_of
 from scipy.optimize import brentq
 
-from pipeline.config.params import parse
-from pipeline.errors import LawError, ParamsError
-from pipeline.laws.predictive.horizon import horizon_of
-from pipeline.laws.predictive.loads import loads_of
-from pipeline.laws.predictive.moves import Moves
-from pipeline.laws.predictive.params import PredictiveParams, limits_of
-from pipeline.laws.predictive.plan import Cost, Planner
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.laws.predictive.soft_limits import EPS, PRICE, SOFT, SoftLimits
-from pipeline.models.identified.identified import Identified
-from pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import LawError, ParamsError
+from loopwright.pipeline.laws.predictive.horizon import horizon_of
+from loopwright.pipeline.laws.predictive.loads import loads_of
+from loopwright.pipeline.laws.predictive.moves import Moves
+from loopwright.pipeline.laws.predictive.params import PredictiveParams, limits_of
+from loopwright.pipeline.laws.predictive.plan import Cost, Planner
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.laws.predictive.soft_limits import EPS, PRICE, SOFT, SoftLimits
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.equations import EquationPlant
 
 SMALL = {"horizon": 12, "moves": 4}
 

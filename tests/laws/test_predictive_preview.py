@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from identified_models import TOP, first_order, random_model
 from predictive_loops import closed, law_of, row
 
-from pipeline.config.params import parse
-from pipeline.errors import ParamsError
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.laws.predictive.set_points import SetPoints
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.laws.predictive.set_points import SetPoints
 
 SMALL = {"horizon": 12, "moves": 5}
 changes = st.floats(-1, 1)

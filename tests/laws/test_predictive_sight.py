@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from identified_models import first_order, made_signals
 
-from pipeline.errors import LawError
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.laws.predictive.settling import AFTER
-from pipeline.laws.predictive.sight import Sight
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.laws.predictive.settling import AFTER
+from loopwright.pipeline.laws.predictive.sight import Sight
 
 
 def designed(pole: float, dead: int, horizon: int | None = None) -> Predictive:

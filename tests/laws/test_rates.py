@@ -11,15 +11,15 @@ import pytest
 import torch
 from identified_models import made_signals, random_model
 
-from pipeline.config.params import parse
-from pipeline.errors import LawError, ParamsError
-from pipeline.export.gate import export
-from pipeline.laws.pid.pid import PID
-from pipeline.laws.predictive.predictive import Predictive
-from pipeline.laws.rates import Rates, rates_of
-from pipeline.plants.signals import Signals
-from serving.card import card
-from serving.controller import Controller
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import LawError, ParamsError
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws.pid.pid import PID
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.laws.rates import Rates, rates_of
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving.card import card
+from loopwright.serving.controller import Controller
 
 
 def slow(*moves: float | None) -> Signals:

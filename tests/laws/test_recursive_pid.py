@@ -10,21 +10,21 @@ import pytest
 import torch
 from shipped import required
 
-from pipeline.cases import CASES
-from pipeline.errors import LawError
-from pipeline.evaluation.case import Case
-from pipeline.excitation.batches import Batches
-from pipeline.excitation.sequences import RandomSteps
-from pipeline.laws.base import ControlLaw
-from pipeline.laws.gain_update import gain_update
-from pipeline.laws.recursive.recursive_pid import RecursivePid
-from pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
-from pipeline.models import Model
-from pipeline.models.lagged.arx import ARX, ArxPart
-from pipeline.models.part import Source
-from pipeline.records.record import Record
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import Trajectory, simulate_closed
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.excitation.batches import Batches
+from loopwright.pipeline.excitation.sequences import RandomSteps
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.laws.gain_update import gain_update
+from loopwright.pipeline.laws.recursive.recursive_pid import RecursivePid
+from loopwright.pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.lagged.arx import ARX, ArxPart
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
 
 DV = torch.zeros(0, dtype=torch.float64)
 PH, BATCH = CASES["ph_neutralization"], CASES["batch_reactor"]

@@ -11,21 +11,26 @@ import reversible_cstr_parts
 import torch
 from torch import Tensor
 
-from pipeline.cases import CASES
-from pipeline.cases.reversible_cstr.plant import ReversibleCstr
-from pipeline.errors import LawError
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
-from pipeline.laws.reference.pi_reference import PiReference
-from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
-from pipeline.laws.reference.reference_networks import IncrementalNetwork, Trainable, TrainablePi, TwoErrorNetwork
-from pipeline.laws.reference.reference_training import follow, train
-from pipeline.models.state_space.state_space import StateSpace
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.signals import Signals
-from pipeline.simulation.simulate import Trajectory, simulate_closed
-from pipeline.tuning.reference_model import ReferenceModel
-from pipeline.tuning.rules import AllPole
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.reversible_cstr.plant import ReversibleCstr
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
+from loopwright.pipeline.laws.reference.pi_reference import PiReference
+from loopwright.pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
+from loopwright.pipeline.laws.reference.reference_networks import (
+    IncrementalNetwork,
+    Trainable,
+    TrainablePi,
+    TwoErrorNetwork,
+)
+from loopwright.pipeline.laws.reference.reference_training import follow, train
+from loopwright.pipeline.models.state_space.state_space import StateSpace
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
+from loopwright.pipeline.tuning.reference_model import ReferenceModel
+from loopwright.pipeline.tuning.rules import AllPole
 
 CASE = CASES["reversible_cstr"]
 TRAINING = Training(noise=0.002, restarts=1, iterations=20, lanes=27)

@@ -7,15 +7,15 @@ import pytest
 import torch
 from shipped import required
 
-from pipeline.cases import CASES
-from pipeline.excitation.sequences import RandomSteps
-from pipeline.laws.base import ControlLaw
-from pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
-from pipeline.models import Model
-from pipeline.models.lagged.arx import ARX, ArxPart
-from pipeline.models.part import Source
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import simulate_closed
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.excitation.sequences import RandomSteps
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.lagged.arx import ARX, ArxPart
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import simulate_closed
 
 DV = torch.zeros(0, dtype=torch.float64)
 PH = CASES["ph_neutralization"]

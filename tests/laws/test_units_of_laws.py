@@ -12,18 +12,18 @@ import pytest
 import torch
 from quick_laws import CALM, FORMS, QUICK, plant_of, quick_parts, rest_points
 
-from pipeline.config.params import parse
-from pipeline.errors import LawError, ParamsError
-from pipeline.laws import LAWS, ControlLaw
-from pipeline.laws.ranges import OfRange
-from pipeline.models import Model
-from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from pipeline.models.local.local_models import LocalModels
-from pipeline.models.static.mlp import MLP
-from pipeline.plants.signals import Signals
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import simulate_closed
-from serving.manifest import Signal
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import LawError, ParamsError
+from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.laws.ranges import OfRange
+from loopwright.pipeline.models import Model
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import simulate_closed
+from loopwright.serving.manifest import Signal
 
 PV, MV = 1000.0, 0.01  # K in mK, % in shares: factors of all PVs, and of all MVs that are not on or off
 HOLD = 12

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.errors import ModelError, ParamsError
-from pipeline.models import MODELS, load_model
-from pipeline.models.lagged.arx import ARX, ArxPart
-from pipeline.models.part import Source
-from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.records.record import Record
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.errors import ModelError, ParamsError
+from loopwright.pipeline.models import MODELS, load_model
+from loopwright.pipeline.models.lagged.arx import ARX, ArxPart
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.models.training.regressors import nnarx_pairs
+from loopwright.pipeline.records.record import Record
 
 
 def linear_record(noise: float = 0.0, samples: int = 800) -> Record:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from pipeline.models.part import Groundwork, Source, done, groundworks
-from pipeline.plants.signals import Signals
-from serving.manifest import Signal
+from loopwright.pipeline.models.part import Groundwork, Source, done, groundworks
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving.manifest import Signal
 
 Y, U = Signal("y", "m", 0.0, 1.0), Signal("u", "V", 0.0, 1.0)
 SOURCE = Source(None, Signals(1.0, (Y,), (Y,), (), (U,)))

@@ -11,18 +11,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.cases.jacketed_batch_reactor.excitations import JacketPulses
-from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
-from pipeline.cases.jacketed_batch_reactor.models import PrintedFuzzyPart, printed_model
-from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
-from pipeline.errors import ModelError
-from pipeline.models import MODELS, load_model
-from pipeline.models.base import simulate
-from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from pipeline.models.fuzzy.hybrid_fuzzy_identification import LEAST, Rules, Transitions, identify
-from pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart, coefficients, gap
-from pipeline.models.part import Source
-from pipeline.records.record import Record
+from loopwright.pipeline.cases.jacketed_batch_reactor.excitations import JacketPulses
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
+from loopwright.pipeline.cases.jacketed_batch_reactor.models import PrintedFuzzyPart, printed_model
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models import MODELS, load_model
+from loopwright.pipeline.models.base import simulate
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_identification import LEAST, Rules, Transitions, identify
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart, coefficients, gap
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.records.record import Record
 
 CENTRES = (12.0, 20.0, 40.0, 60.0, 70.0)
 How = Literal["tied", "global", "local"]

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch.func import jacrev, vmap
 
-from pipeline.errors import ModelError
-from pipeline.models.lagged.instantaneous import AlongMv, arx, linearize
-from pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.lagged.instantaneous import AlongMv, arx, linearize
+from loopwright.pipeline.models.lagged.nnarx import NNARX
 
 SHAPES = [
     (n_y, n_u, hidden, residual)

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ModelError
-from pipeline.models.base import load_model
-from pipeline.models.static.leverage_domain import LeverageDomain
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import load_model
+from loopwright.pipeline.models.static.leverage_domain import LeverageDomain
 
 seeds = st.integers(0, 10_000)
 factors = st.floats(1.0, 50.0)

@@ -9,12 +9,12 @@ from henson_seborg_cstr_parts import POINTS, local_models
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
-from pipeline.errors import ModelError
-from pipeline.models.base import load_model
-from pipeline.models.local.local_models import LocalModels, Validity, spacing
-from pipeline.models.local.local_models_part import LocalModelsPart, free_run, operating_cv
-from pipeline.models.part import Source
+from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import load_model
+from loopwright.pipeline.models.local.local_models import LocalModels, Validity, spacing
+from loopwright.pipeline.models.local.local_models_part import LocalModelsPart, free_run, operating_cv
+from loopwright.pipeline.models.part import Source
 
 EXPECTED = [  # C, T, q_c solved exactly
     (0.129825, 432.949, 110.0),

@@ -12,11 +12,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ModelError
-from pipeline.models import MODELS, load_model
-from pipeline.models.local.linearized import Linearized
-from pipeline.models.static.mlp import MLP
-from pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models import MODELS, load_model
+from loopwright.pipeline.models.local.linearized import Linearized
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.plants.equations import EquationPlant
 
 
 def data(n: int = 200, n_in: int = 3, n_out: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -11,17 +11,17 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.config.params import parse
-from pipeline.errors import ModelError, ParamsError, RecordError
-from pipeline.models import load_model
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.lagged.nnarx_part import Candidate, NnarxPart, parsimonious
-from pipeline.models.part import Source
-from pipeline.models.training.objectives import Windows, regressor
-from pipeline.models.training.regressors import longest_run, nnarx_pairs, split_in_time
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import ModelError, ParamsError, RecordError
+from loopwright.pipeline.models import load_model
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.nnarx_part import Candidate, NnarxPart, parsimonious
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.models.training.objectives import Windows, regressor
+from loopwright.pipeline.models.training.regressors import longest_run, nnarx_pairs, split_in_time
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 
 def made_up_record(runs: tuple[int, ...] = (30, 25), n_mv: int = 2, seed: int = 0) -> Record:

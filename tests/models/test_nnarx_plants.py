@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.cases import PLANTS
-from pipeline.excitation import EXCITATIONS
-from pipeline.metrics import rmse
-from pipeline.models import Learnt
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.lagged.nnarx_part import NnarxPart
-from pipeline.models.part import Source, predict
-from pipeline.models.training.objectives import Windows
-from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.plants.equations import EquationPlant
-from pipeline.records.record import Record
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.excitation import EXCITATIONS
+from loopwright.pipeline.metrics import rmse
+from loopwright.pipeline.models import Learnt
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.nnarx_part import NnarxPart
+from loopwright.pipeline.models.part import Source, predict
+from loopwright.pipeline.models.training.objectives import Windows
+from loopwright.pipeline.models.training.regressors import nnarx_pairs
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.records.record import Record
 
 SEEDS = (0, 1, 2)
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.cases.ph_neutralization.identification_example import example_record
-from pipeline.errors import ModelError, RecordError
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.lagged.one_step import VARIANCE, OneStep, compare_one_step
-from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.records.record import Record
+from loopwright.pipeline.cases.ph_neutralization.identification_example import example_record
+from loopwright.pipeline.errors import ModelError, RecordError
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.one_step import VARIANCE, OneStep, compare_one_step
+from loopwright.pipeline.models.training.regressors import nnarx_pairs
+from loopwright.pipeline.records.record import Record
 
 
 def a_record(n: int = 40, seed: int = 0) -> Record:

@@ -15,14 +15,14 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ModelError
-from pipeline.models import MODELS, load_model
-from pipeline.models.static.fuzzy_means import FuzzyMeansRBF, grid_points, select_centres
-from pipeline.models.static.rbf import BASES, RBF, design_matrix
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models import MODELS, load_model
+from loopwright.pipeline.models.static.fuzzy_means import FuzzyMeansRBF, grid_points, select_centres
+from loopwright.pipeline.models.static.rbf import BASES, RBF, design_matrix
 
 CHECKS = """
 from sklearn.utils.estimator_checks import check_estimator
-from pipeline.models.static.fuzzy_means import FuzzyMeansRBF
+from loopwright.pipeline.models.static.fuzzy_means import FuzzyMeansRBF
 for estimator in (FuzzyMeansRBF(), FuzzyMeansRBF(5, basis="gaussian", ridge=1e-6)):
     results = check_estimator(estimator, on_skip="warn", on_fail="raise")
     assert len(results) > 40 and all(r["status"] == "passed" for r in results), results

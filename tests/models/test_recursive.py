@@ -8,8 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ModelError
-from pipeline.models.lagged.recursive import RecursiveLeastSquares
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.lagged.recursive import RecursiveLeastSquares
 
 
 def drawn(seed: int, rows: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ParamsError, RecordError
-from pipeline.models.training.regressors import Pairs, forward_pairs, inverse_pairs, nnarx_pairs
-from pipeline.records.record import Record, position_in_run
-from serving.manifest import Signal
+from loopwright.pipeline.errors import ParamsError, RecordError
+from loopwright.pipeline.models.training.regressors import Pairs, forward_pairs, inverse_pairs, nnarx_pairs
+from loopwright.pipeline.records.record import Record, position_in_run
+from loopwright.serving.manifest import Signal
 
 PV = (Signal("y", "m", 0.0, 1e4), Signal("z", "m", 0.0, 1e4))
 MV = (Signal("u", "V", 0.0, 1e4), Signal("v", "V", 0.0, 1e4))

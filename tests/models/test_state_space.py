@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 from torch.func import functional_call
 
-from pipeline.cases.reversible_cstr.plant import ReversibleCstr
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.errors import ModelError, ParamsError, RecordError
-from pipeline.excitation import EXCITATIONS
-from pipeline.models import load_model
-from pipeline.models.base import simulate
-from pipeline.models.lagged.nnarx_part import NnarxPart
-from pipeline.models.part import Source
-from pipeline.models.state_space.state_space import StateSpace, StateSpacePart, one_step_pairs
-from pipeline.models.state_space.state_windows import StateWindows
-from pipeline.models.training.objectives import Samples
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.cases.reversible_cstr.plant import ReversibleCstr
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.errors import ModelError, ParamsError, RecordError
+from loopwright.pipeline.excitation import EXCITATIONS
+from loopwright.pipeline.models import load_model
+from loopwright.pipeline.models.base import simulate
+from loopwright.pipeline.models.lagged.nnarx_part import NnarxPart
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.models.state_space.state_space import StateSpace, StateSpacePart, one_step_pairs
+from loopwright.pipeline.models.state_space.state_windows import StateWindows
+from loopwright.pipeline.models.training.objectives import Samples
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 
 def made_up_record(runs: tuple[int, ...] = (30, 25), n_mv: int = 2, seed: int = 0) -> Record:

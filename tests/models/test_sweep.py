@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.cases import PLANTS
-from pipeline.errors import ModelError
-from pipeline.models.static.fuzzy_means import FuzzyMeansRBF, grid_points, select_centres, to_grid
-from pipeline.models.static.least_squares import solve_iterative, solve_qr
-from pipeline.models.static.rbf import design_matrix
-from pipeline.models.static.sweep import SweepResult, _cells, sweep
-from pipeline.pictures.sweep_plot import draw
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.static.fuzzy_means import FuzzyMeansRBF, grid_points, select_centres, to_grid
+from loopwright.pipeline.models.static.least_squares import solve_iterative, solve_qr
+from loopwright.pipeline.models.static.rbf import design_matrix
+from loopwright.pipeline.models.static.sweep import SweepResult, _cells, sweep
+from loopwright.pipeline.pictures.sweep_plot import draw
 
 
 @pytest.fixture(scope="module")

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from whole_bounds import whole_bounds
 
-from pipeline.cases import CASES
-from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
-from pipeline.cases.ph_neutralization.plant import PhNeutralization
-from pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.errors import LawError
-from pipeline.evaluation.closed_loop import closed_loop_metrics
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.metric import METRICS
-from pipeline.optimal.bounds import (
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization
+from loopwright.pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.metric import METRICS
+from loopwright.pipeline.optimal.bounds import (
     DEFAULTS,
     bounded,
     bounds_path,
@@ -31,10 +31,10 @@ from pipeline.optimal.bounds import (
     stored_bounds,
     together,
 )
-from pipeline.optimal.horizon import Horizon, Plan
-from pipeline.optimal.perfect import run_offline
-from pipeline.simulation.scenario import Scenario
-from pipeline.stages import bounds as bounds_stage
+from loopwright.pipeline.optimal.horizon import Horizon, Plan
+from loopwright.pipeline.optimal.perfect import run_offline
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.stages import bounds as bounds_stage
 
 
 @dataclass(frozen=True)

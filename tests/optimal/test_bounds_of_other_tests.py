@@ -12,23 +12,23 @@ import numpy as np
 import pytest
 from whole_bounds import whole_bounds
 
-from pipeline.cases import PLANTS
-from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
-from pipeline.cases.jacketed_batch_reactor.plant import COLD, HOT, LEAK, JacketedBatchReactor, SignedFlow
-from pipeline.cases.reversible_cstr.plant import ReversibleCstr
-from pipeline.errors import PlantError
-from pipeline.evaluation.case import Array, Case
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.metric import METRICS, Metric
-from pipeline.optimal.bounds import plant_digest
-from pipeline.optimal.horizon import Horizon
-from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.scenario import Scenario, held
-from pipeline.simulation.simulate import simulate_closed, simulate_open
-from pipeline.stages import bounds as bounds_stage
-from pipeline.tuning.reference_model import ReferenceModel
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import COLD, HOT, LEAK, JacketedBatchReactor, SignedFlow
+from loopwright.pipeline.cases.reversible_cstr.plant import ReversibleCstr
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.case import Array, Case
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.metric import METRICS, Metric
+from loopwright.pipeline.optimal.bounds import plant_digest
+from loopwright.pipeline.optimal.horizon import Horizon
+from loopwright.pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.scenario import Scenario, held
+from loopwright.pipeline.simulation.simulate import simulate_closed, simulate_open
+from loopwright.pipeline.stages import bounds as bounds_stage
+from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
 QUICK = Effort(periods=20, elements=1, fine=1, degree=2, reaches=(3,), tail=10, every=5, noisy=False)
 
@@ -142,7 +142,7 @@ def test_a_discrete_mv_without_relaxation_is_refused(vessel: JacketedBatchReacto
 
 def test_the_digest_follows_the_relaxation(vessel: JacketedBatchReactor, monkeypatch: pytest.MonkeyPatch) -> None:
     own = plant_digest(vessel)
-    monkeypatch.setattr("pipeline.cases.jacketed_batch_reactor.plant.LEAK", 0.1)
+    monkeypatch.setattr("loopwright.pipeline.cases.jacketed_batch_reactor.plant.LEAK", 0.1)
     assert plant_digest(vessel) != own
 
 

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from pipeline.__main__ import main
-from pipeline.cases import CASES
-from pipeline.cases.batch_reactor.plant import BatchReactor
-from pipeline.errors import PlantError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.metric import METRICS
-from pipeline.metrics import mae
-from pipeline.optimal.horizon import Horizon
-from pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline, search
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import simulate_closed
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.batch_reactor.plant import BatchReactor
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.metric import METRICS
+from loopwright.pipeline.metrics import mae
+from loopwright.pipeline.optimal.horizon import Horizon
+from loopwright.pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline, search
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import simulate_closed
 
 
 @pytest.fixture(scope="module")

@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from own_cases import two_lags
 
-from pipeline.cases.own_plant import own_case
-from pipeline.optimal import model_bounds as kept_bounds
-from pipeline.optimal.model_bounds import model_bounds
-from pipeline.optimal.sampled import SampledHorizon, run_sampled, shares, transition
-from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from pipeline.plants.signals import Signals
-from pipeline.simulation.scenario import Scenario
-from serving.manifest import Signal
+from loopwright.pipeline.cases.own_plant import own_case
+from loopwright.pipeline.optimal import model_bounds as kept_bounds
+from loopwright.pipeline.optimal.model_bounds import model_bounds
+from loopwright.pipeline.optimal.sampled import SampledHorizon, run_sampled, shares, transition
+from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.serving.manifest import Signal
 
 POLE, GAIN = 0.9, 2.0
 

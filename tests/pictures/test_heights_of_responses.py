@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.pictures.identified_pictures import _heights
+from loopwright.pipeline.pictures.identified_pictures import _heights
 
 MIDDLE = np.array([0.0, 1.0, 2.0])
 

@@ -15,15 +15,15 @@ from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 from own_cases import case_of
 
-from pipeline.cases.own_plant import OwnCase
-from pipeline.pictures.drawing import STYLE, symbol
-from pipeline.pictures.identified_pictures import (
+from loopwright.pipeline.cases.own_plant import OwnCase
+from loopwright.pipeline.pictures.drawing import STYLE, symbol
+from loopwright.pipeline.pictures.identified_pictures import (
     IN_TABLE,
     free_run_picture,
     gains_picture,
     step_responses_picture,
 )
-from pipeline.pictures.loop_pictures import LoopPanels
+from loopwright.pipeline.pictures.loop_pictures import LoopPanels
 
 GAINS = np.array([[2.0, -0.8, 0.3, 0.01], [0.6, 1.5, -0.2, -0.03]])
 N_Y, N_MV, N_DV = 2, 3, 1

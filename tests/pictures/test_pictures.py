@@ -14,16 +14,16 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.cases import CASES, PLANTS
-from pipeline.cases.jacketed_batch_reactor.pictures import recipe_picture, switches_picture
-from pipeline.evaluation.case import Curve
-from pipeline.evaluation.evidence import Evidence
-from pipeline.pictures import loop_picture
-from pipeline.pictures.drawing import STYLE, clear_legend, layer, legend_below, scale
-from pipeline.pictures.loop_pictures import LoopPanels, info_label, rings, too_fast
-from pipeline.pictures.model_pictures import candidates_picture
-from pipeline.report import figures
-from serving.manifest import Signal
+from loopwright.pipeline.cases import CASES, PLANTS
+from loopwright.pipeline.cases.jacketed_batch_reactor.pictures import recipe_picture, switches_picture
+from loopwright.pipeline.evaluation.case import Curve
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.pictures import loop_picture
+from loopwright.pipeline.pictures.drawing import STYLE, clear_legend, layer, legend_below, scale
+from loopwright.pipeline.pictures.loop_pictures import LoopPanels, info_label, rings, too_fast
+from loopwright.pipeline.pictures.model_pictures import candidates_picture
+from loopwright.pipeline.report import figures
+from loopwright.serving.manifest import Signal
 
 FLOW = Signal("q", "l/s", 0.0, 10.0)
 MINIS = (made_up.THIOSULFATE, made_up.PH, made_up.BATCH)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from identified_models import made_signals
 
-from pipeline.pictures.loop_picture import History, summary
+from loopwright.pipeline.pictures.loop_picture import History, summary
 
 
 class Plant:

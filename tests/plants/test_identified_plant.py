@@ -7,10 +7,10 @@ import pickle
 import numpy as np
 import pytest
 
-from pipeline.errors import PlantError
-from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from pipeline.plants.signals import Signals
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving.manifest import Signal
 
 LEVELS = (Signal("T", "degC", 0.0, 100.0), Signal("L", "m", 0.0, 4.0))
 SIGNALS = Signals(5.0, LEVELS, LEVELS, (Signal("F", "kg/s", 0.0, 2.0),), (Signal("V", "%", 0.0, 100.0),))

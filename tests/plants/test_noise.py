@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
-from pipeline.plants.noise import level_gain, noise_and_change
+from loopwright.pipeline.plants.noise import level_gain, noise_and_change
 
 N = 4000
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from made_up_plant import Lag
 
-from pipeline.cases import PLANTS
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.errors import PlantError
-from pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.equations import EquationPlant
 
 
 @pytest.fixture(scope="module")

@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 from tank_simulator import Tanks
 
-from pipeline.__main__ import main
-from pipeline.cases import PLANTS
-from pipeline.errors import PlantError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.law_evidence import BASE
-from pipeline.evaluation.trials import try_files
-from pipeline.excitation import EXCITATIONS
-from pipeline.export.gate import export
-from pipeline.laws import LAWS
-from pipeline.models.lagged.arx import ArxPart
-from pipeline.models.local.linearized import LinearizedPart
-from pipeline.models.part import Source
-from pipeline.optimal.bounds import problem
-from pipeline.plants.simulator import Simulator
-from pipeline.simulation.scenario import Scenario, from_rest, held
-from pipeline.simulation.simulate import simulate_batch, simulate_open
-from pipeline.tuning.reduction import start_lag
-from serving.manifest import Signal
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.law_evidence import BASE
+from loopwright.pipeline.evaluation.trials import try_files
+from loopwright.pipeline.excitation import EXCITATIONS
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.models.lagged.arx import ArxPart
+from loopwright.pipeline.models.local.linearized import LinearizedPart
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.optimal.bounds import problem
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.simulation.scenario import Scenario, from_rest, held
+from loopwright.pipeline.simulation.simulate import simulate_batch, simulate_open
+from loopwright.pipeline.tuning.reduction import start_lag
+from loopwright.serving.manifest import Signal
 
 PID = LAWS["pid"]
 QUICK = {"development_seeds": (1, 2), "development_set_points": 2, "development_hold": 40}

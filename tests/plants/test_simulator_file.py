@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.errors import PlantError
-from pipeline.plants.simulator_file import NOISE_SHARE, FileSimulator
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.simulator_file import NOISE_SHARE, FileSimulator
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_simulator" / "heater.py"
 LAG = """

@@ -15,14 +15,22 @@ import numpy as np
 import onnx
 import pytest
 
-from pipeline.__main__ import main
-from pipeline.cases import CASES
-from pipeline.commands.playground import page_of
-from pipeline.errors import PipelineError
-from pipeline.files import sha256
-from pipeline.playground import web_runtime as runtime
-from pipeline.playground.server import file_server
-from pipeline.playground.site import LOOP, OPERATORS, SHARED, STATIC, Playground, write_folder, write_one_file
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.commands.playground import page_of
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.files import sha256
+from loopwright.pipeline.playground import web_runtime as runtime
+from loopwright.pipeline.playground.server import file_server
+from loopwright.pipeline.playground.site import (
+    LOOP,
+    OPERATORS,
+    SHARED,
+    STATIC,
+    Playground,
+    write_folder,
+    write_one_file,
+)
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 CASE = "reversible_cstr"

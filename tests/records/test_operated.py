@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.historian.grid import Grid
-from pipeline.historian.old_controller import old_controllers
-from pipeline.historian.operated import operated
-from pipeline.historian.tags import Tag
-from pipeline.records.operated import operation
+from loopwright.pipeline.historian.grid import Grid
+from loopwright.pipeline.historian.old_controller import old_controllers
+from loopwright.pipeline.historian.operated import operated
+from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.records.operated import operation
 
 SP = np.array([10.0, 10.0, 10.0, 12.0, 12.0, 12.0])
 PV = np.array([10.0, 11.0, 10.0, 10.0, 11.0, 12.0])

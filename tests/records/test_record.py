@@ -10,10 +10,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pipeline.errors import RecordError
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record, broken_run, position_in_run
-from serving.manifest import Signal
+from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record, broken_run, position_in_run
+from loopwright.serving.manifest import Signal
 
 PV = (Signal("C_A", "mol/l", 0.0, 1.0), Signal("T", "K", 200.0, 600.0))
 MV = (Signal("T_j", "K", 0.0, 500.0),)

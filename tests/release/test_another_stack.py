@@ -23,10 +23,10 @@ from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 from plant_servers import RunningLoop, free_port
 from processes import within
 
-from pipeline.__main__ import main
-from serving import Mode
-from serving.journal import JournalReader
-from serving.opcua.certificates import APPLICATION, make, valid_until
+from loopwright.pipeline.__main__ import main
+from loopwright.serving import Mode
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.opcua.certificates import APPLICATION, make, valid_until
 
 HERE = Path(__file__).parents[1] / "node_opcua"
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"

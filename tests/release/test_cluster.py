@@ -25,7 +25,7 @@ from dask_cluster import ROOT, Cluster, joined, two_workers  # noqa: F401
 from engine_pieces import fatal, pages_of, process_of, refuse, squares, sums_of_squares, waking_ms, watched
 from processes import within
 
-from pipeline.engine.cluster import (
+from loopwright.pipeline.engine.cluster import (
     ADDRESS,
     MEMORY,
     OF_THE_PAGE,
@@ -35,10 +35,10 @@ from pipeline.engine.cluster import (
     local_cluster,
     usual_workers,
 )
-from pipeline.engine.fingerprint import fingerprint
-from pipeline.engine.parallel import _answers, parallel_map
-from pipeline.engine.pieces import Task
-from pipeline.errors import PipelineError
+from loopwright.pipeline.engine.fingerprint import fingerprint
+from loopwright.pipeline.engine.parallel import _answers, parallel_map
+from loopwright.pipeline.engine.pieces import Task
+from loopwright.pipeline.errors import PipelineError
 
 # Dask closes some of its sockets only as it is collected.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -122,11 +122,11 @@ def test_a_result_counts_whose_worker_was_lost_a_moment_later(address: str, monk
 def test_a_worker_that_is_killed_costs_its_piece_alone(address: str, tmp_path: Path) -> None:
     asked = f"""
 import sys
-sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / "tests")!r}]
+sys.path[:0] = [{str(ROOT / "tools/roots")!r}, {str(ROOT / "tests")!r}]
 from functools import partial
 from pathlib import Path
 from engine_pieces import pid_of
-from pipeline.engine.parallel import _answers, parallel_map
+from loopwright.pipeline.engine.parallel import _answers, parallel_map
 print(parallel_map(partial(pid_of, Path({str(tmp_path)!r})), range(6), "squares"))
 """
     process = subprocess.Popen([sys.executable, "-c", asked], stdout=subprocess.PIPE, text=True)
@@ -146,9 +146,9 @@ def test_a_worker_of_other_sources_or_libraries_refuses_in_one_line(
     """Its sources differ by a comment, or it finds another version of a library."""
     sources = tmp_path / "sources"
     for room in ("pipeline", "serving"):
-        shutil.copytree(ROOT / room, sources / room, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / room, sources / "loopwright" / room, ignore=shutil.ignore_patterns("__pycache__"))
     if other == "code":
-        with (sources / "pipeline" / "errors.py").open("a") as file:
+        with (sources / "loopwright" / "pipeline" / "errors.py").open("a") as file:
             file.write("# another day's\n")
     else:
         (sources / "numpy-0.9.0.dist-info").mkdir()
@@ -171,7 +171,7 @@ def test_a_worker_of_other_sources_or_libraries_refuses_in_one_line(
 
 
 def test_a_scheduler_without_workers_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.engine.cluster.WORKERS_S", 1.0)
+    monkeypatch.setattr("loopwright.pipeline.engine.cluster.WORKERS_S", 1.0)
     made = Cluster(tmp_path)
     try:
         at = str(json.loads(made.file.read_text())["address"])
@@ -186,7 +186,7 @@ def test_a_cluster_of_this_machine_has_the_workers_asked_for_and_ends_with_its_b
 ) -> None:
     monkeypatch.delenv(ADDRESS, raising=False)
     monkeypatch.setenv(WORKERS, "2")
-    monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])  # which takes seconds
+    monkeypatch.setattr("loopwright.pipeline.engine.cluster.PRELOAD", [])  # which takes seconds
     said = list[str]()
     with local_cluster(say=said.append) as at:
         assert os.environ[ADDRESS] == at
@@ -207,7 +207,7 @@ def test_workers_of_this_machine_keep_memory_that_is_freed_and_seldom_look_at_th
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv(ADDRESS, raising=False)
-    monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])
+    monkeypatch.setattr("loopwright.pipeline.engine.cluster.PRELOAD", [])
     for name in MEMORY:
         monkeypatch.delenv(name, raising=False)
     once = 16 * 1024**2 // resource.getpagesize()
@@ -221,7 +221,7 @@ def test_workers_of_this_machine_keep_memory_that_is_freed_and_seldom_look_at_th
 
 def test_another_program_has_the_port_that_dask_would_take(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(ADDRESS, raising=False)
-    monkeypatch.setattr("pipeline.engine.cluster.PRELOAD", [])
+    monkeypatch.setattr("loopwright.pipeline.engine.cluster.PRELOAD", [])
     with socket.socket() as taken:
         with contextlib.suppress(OSError):  # somebody has it already
             taken.bind(("127.0.0.1", 8787))

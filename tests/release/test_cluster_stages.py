@@ -14,14 +14,14 @@ from dask_cluster import ROOT, joined, two_workers  # noqa: F401
 from own_cases import controllers_of_a_lag
 from processes import within
 
-from pipeline.engine.cluster import ADDRESS, connected
-from pipeline.engine.folder import read_files
-from pipeline.engine.stage_files import DATA
-from pipeline.files import write_json
-from pipeline.stages.design import design
-from pipeline.stages.excite import excite
-from pipeline.stages.fit import fit
-from pipeline.stages.validate import validate
+from loopwright.pipeline.engine.cluster import ADDRESS, connected
+from loopwright.pipeline.engine.folder import read_files
+from loopwright.pipeline.engine.stage_files import DATA
+from loopwright.pipeline.files import write_json
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.excite import excite
+from loopwright.pipeline.stages.fit import fit
+from loopwright.pipeline.stages.validate import validate
 
 # Dask closes some of its sockets only as it is collected.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -38,8 +38,8 @@ def plant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def begin(stage: str, name: str) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command, pipe = [sys.executable, "-m", "pipeline.engine.start", stage, name], subprocess.PIPE
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
+    command, pipe = [sys.executable, "-m", "loopwright.pipeline.engine.start", stage, name], subprocess.PIPE
     return subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True)
 
 

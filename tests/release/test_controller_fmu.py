@@ -14,14 +14,14 @@ import pytest
 from controller_fmus import MISSING, Array, Unit, answers_of, controller_of, file_of, tools, unpacked
 from kits import SHIPPED, name
 
-from pipeline.cases import PLANTS
-from pipeline.errors import HostError
-from pipeline.hosts.fmu.description import build_description, description, token_of
-from pipeline.hosts.fmu.folder import identifier_of, pack, write_folder
-from pipeline.hosts.fmu.gate import check, problems
-from pipeline.hosts.fmu.variables import variables_of
-from serving import Controller
-from serving.conformance.steps import Answer, answered
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.errors import HostError
+from loopwright.pipeline.hosts.fmu.description import build_description, description, token_of
+from loopwright.pipeline.hosts.fmu.folder import identifier_of, pack, write_folder
+from loopwright.pipeline.hosts.fmu.gate import check, problems
+from loopwright.pipeline.hosts.fmu.variables import variables_of
+from loopwright.serving import Controller
+from loopwright.serving.conformance.steps import Answer, answered
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)

@@ -12,16 +12,16 @@ import pytest
 import yaml
 from undrawn import draw_nothing
 
-from pipeline.__main__ import main
-from pipeline.stages.check import mistakes
-from pipeline.stages.design import design
-from pipeline.stages.fit import fit
-from pipeline.stages.overview import overview
-from pipeline.stages.report import report
-from pipeline.stages.screen import screen
-from pipeline.stages.validate import validate
-from serving import Controller
-from serving.card import card
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.stages.check import mistakes
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.fit import fit
+from loopwright.pipeline.stages.overview import overview
+from loopwright.pipeline.stages.report import report
+from loopwright.pipeline.stages.screen import screen
+from loopwright.pipeline.stages.validate import validate
+from loopwright.serving import Controller
+from loopwright.serving.card import card
 
 ROOT = Path(__file__).parents[2]
 ROLES = ("--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]=0..100", "--dv", "FI-7[kg/h]", "--sp", "TIC-101.SP")

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from controller_fmus import MISSING, answers_of, controller_of, tools, unpacked
 
-from pipeline.hosts.fmu.compiling import HOSTS, SOURCES
-from pipeline.hosts.fmu.description import token_of
+from loopwright.pipeline.hosts.fmu.compiling import HOSTS, SOURCES
+from loopwright.pipeline.hosts.fmu.description import token_of
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)

@@ -15,8 +15,8 @@ import pytest
 from chromium import CHROMIUM, come_in
 from fake_loop import BEGIN, FakeLoop
 
-from serving.journal import Event
-from serving.monitor.verdict import when
+from loopwright.serving.journal import Event
+from loopwright.serving.monitor.verdict import when
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)

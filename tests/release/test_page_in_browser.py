@@ -17,7 +17,7 @@ from PIL import Image
 from plant_servers import Plant, RunningLoop, spoil
 from processes import within
 
-from pipeline.__main__ import main
+from loopwright.pipeline.__main__ import main
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)

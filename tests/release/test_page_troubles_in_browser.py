@@ -8,7 +8,7 @@ import pytest
 from chromium import CHROMIUM
 from fake_loop import BEGIN, THIRDS, FakeLoop
 
-from serving.journal import Event, Scan
+from loopwright.serving.journal import Event, Scan
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)

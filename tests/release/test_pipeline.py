@@ -17,8 +17,8 @@ import pytest
 import yaml
 from processes import within
 
-from pipeline.engine.dvc import COMMAND, PYTHON
-from pipeline.engine.start import STAGES
+from loopwright.pipeline.engine.dvc import COMMAND, PYTHON
+from loopwright.pipeline.engine.start import STAGES
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from reduced import reduced
@@ -33,7 +33,7 @@ ENVIRONMENT = {
     "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
     "DVC_NO_ANALYTICS": "1",
     "MLFLOW_DISABLE_TELEMETRY": "true",
-    "PYTHONPATH": "",
+    "PYTHONPATH": str(ROOT / "tools/roots"),
     "LOOPWRIGHT_WORKERS": "1",  # each loads its libraries for seconds, and these stages are small
     STAGES: "excite,fit,design,validate",
 }
@@ -132,7 +132,7 @@ def copy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Copy]:
     tree["cases"][CASE]["held_out_seeds"] = tree["cases"][CASE]["held_out_seeds"][:1]
     (path / "params.yaml").write_text(yaml.safe_dump(tree, sort_keys=False))
     subprocess.run(["git", "init", "--quiet"], cwd=path, check=True)
-    warm = [sys.executable, "-m", "pipeline.engine.with_cluster", *PYTHON, "-c", WARM]
+    warm = [sys.executable, "-m", "loopwright.pipeline.engine.with_cluster", *PYTHON, "-c", WARM]
     with subprocess.Popen(
         warm, cwd=path, env=ENVIRONMENT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as shell:
@@ -152,8 +152,8 @@ def test_every_output_is_there(copy: Copy) -> None:
     assert (copy.path / "published.json").is_file()
     for name in ("report.html", "report.md"):
         assert PID in (copy.path / "artifacts" / name).read_text(), name
-    assert "inc" in copy.run("python", "-m", "pipeline", "results")
-    assert "held_out / NMPC" in copy.run("python", "-m", "pipeline", "results", CASE)
+    assert "inc" in copy.run("python", "-m", "loopwright.pipeline", "results")
+    assert "held_out / NMPC" in copy.run("python", "-m", "loopwright.pipeline", "results", CASE)
 
 
 def test_a_second_run_does_nothing(copy: Copy) -> None:
@@ -205,7 +205,7 @@ def test_ctrl_c_leaves_one_line_and_no_process_and_a_run_goes_on(copy: Copy, who
     copy.edit(("controllers", PID, "lambda_s"), 3.0)
     mark = f"{os.getpid()}-{whole_group}"
     bare = {**ENVIRONMENT, "PATH": "/usr/bin:/bin", "MARK": mark}
-    command, pipe = [sys.executable, "-m", "pipeline", "run", PID], subprocess.PIPE
+    command, pipe = [sys.executable, "-m", "loopwright.pipeline", "run", PID], subprocess.PIPE
     process = subprocess.Popen(
         command, cwd=copy.path, env=bare, text=True, stdout=pipe, stderr=subprocess.STDOUT, start_new_session=True
     )
@@ -236,7 +236,7 @@ def _marked(variable: bytes) -> list[str]:
 
 def test_a_mistake_in_the_parameters_is_one_line(copy: Copy) -> None:
     copy.edit(("controllers", PID, "narowing"), 2.0)
-    said, code = copy.warm("python", "-m", "pipeline.engine.start", "design", PID)
+    said, code = copy.warm("python", "-m", "loopwright.pipeline.engine.start", "design", PID)
     assert code == 2
     assert said.count("\n") == 1
     assert f"controllers.{PID}: unknown key 'narowing'" in said

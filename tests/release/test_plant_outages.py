@@ -13,8 +13,8 @@ from plant_servers import CASE, PID, ROOT, SPACE, Plant, Wire, loop_toml
 from processes import within
 from served_plant import MODE, PERIOD_S, SPEED, begun, cut, mend, read, served, told, wired, write  # noqa: F401
 
-from serving import Controller, Mode
-from serving.station.settings import Hold
+from loopwright.serving import Controller, Mode
+from loopwright.serving.station.settings import Hold
 
 START = 250.0  # the MV of the plant's start
 LEARNT_WITHIN = 3  # of the loop's own periods: so soon a plant knows that its loop is gone
@@ -26,7 +26,7 @@ def test_a_plant_learns_within_three_periods_that_its_loop_was_killed(plant: Pla
     beats_at = f'heartbeat = "{SPACE}Control.Heartbeat"'
     path = loop_toml(tmp_path, plant.endpoint, speed=SPEED, nodes=beats_at)
     since = len(plant.actuator())
-    command = [sys.executable, "-m", "pipeline", "loop", "run", str(path)]
+    command = [sys.executable, "-m", "loopwright.pipeline", "loop", "run", str(path)]
     with (tmp_path / "said").open("w") as said:
         loop = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=said)
     try:

@@ -21,19 +21,21 @@ import numpy as np
 import pytest
 from chromium import CHROMIUM
 
-from pipeline.cases import CASES
-from pipeline.commands.playground import page_of
-from pipeline.plants.simulator import Array
-from pipeline.playground.server import file_server
-from pipeline.playground.site import write_folder, write_one_file
-from pipeline.playground.web_runtime import kept
-from pipeline.simulation.scenario import Scenario
-from serving import Controller, ControlLoop, Mode, Sample
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.commands.playground import page_of
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.playground.server import file_server
+from loopwright.pipeline.playground.site import write_folder, write_one_file
+from loopwright.pipeline.playground.web_runtime import kept
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.serving import Controller, ControlLoop, Mode, Sample
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 if not kept().exists():
-    pytest.skip("onnxruntime-web is not here (python -m pipeline.playground.web_runtime)", allow_module_level=True)
+    pytest.skip(
+        "onnxruntime-web is not here (python -m loopwright.pipeline.playground.web_runtime)", allow_module_level=True
+    )
 
 from playwright.sync_api import Browser, Page, expect
 
@@ -427,7 +429,7 @@ def test_a_picture_of_a_changed_set_point_a_warmer_feed_and_noise(page: Page, si
 
 
 def test_the_command_serves_the_page_until_it_is_interrupted(page: Page) -> None:
-    code = "import sys; from pipeline.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    code = "import sys; from loopwright.pipeline.__main__ import main; sys.exit(main(sys.argv[1:]))"
     words = ["playground", CASE, "--port", "0", "--artifacts", str(ARTIFACTS)]
     process = subprocess.Popen([sys.executable, "-c", code, *words], stdout=subprocess.PIPE, text=True)
     try:

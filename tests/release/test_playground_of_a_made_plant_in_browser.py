@@ -14,22 +14,24 @@ import torch
 from chromium import CHROMIUM, launched
 from torch import Tensor
 
-from pipeline.evaluation.case import Case
-from pipeline.export.gate import export
-from pipeline.export.plant_graphs import plant_graphs
-from pipeline.laws import ControlLaw
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from pipeline.playground.about import about
-from pipeline.playground.site import Playground, write_one_file
-from pipeline.playground.web_runtime import kept
-from pipeline.simulation.scenario import Scenario
-from serving import Controller, ControlLoop, Mode, Sample, Signal
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.export.plant_graphs import plant_graphs
+from loopwright.pipeline.laws import ControlLaw
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.playground.about import about
+from loopwright.pipeline.playground.site import Playground, write_one_file
+from loopwright.pipeline.playground.web_runtime import kept
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.serving import Controller, ControlLoop, Mode, Sample, Signal
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 if not kept().exists():
-    pytest.skip("onnxruntime-web is not here (python -m pipeline.playground.web_runtime)", allow_module_level=True)
+    pytest.skip(
+        "onnxruntime-web is not here (python -m loopwright.pipeline.playground.web_runtime)", allow_module_level=True
+    )
 
 from playwright.sync_api import expect
 

@@ -20,7 +20,7 @@ OFF = {"DVC_NO_ANALYTICS": "1", "MLFLOW_DISABLE_TELEMETRY": "true", "DO_NOT_TRAC
 # `loopwright` with one line of arguments after another, in a process that loads MLflow once.
 PROMPT = """
 import sys
-from pipeline.__main__ import main
+from loopwright.pipeline.__main__ import main
 for line in sys.stdin:
     print("ended with", main(line.split()), file=sys.stderr, flush=True)
 """
@@ -37,7 +37,7 @@ class Person:
     def environment(self) -> dict[str, str]:
         own = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         without = {k: v for k, v in os.environ.items() if not k.startswith(("AWS_", "MLFLOW_", "DASK_"))}
-        return {**without, **OFF, **self.variables, "PATH": own, "PYTHONPATH": str(self.clone)}
+        return {**without, **OFF, **self.variables, "PATH": own, "PYTHONPATH": str(self.clone / "tools/roots")}
 
     def asks(self, *command: object) -> subprocess.CompletedProcess[str]:
         words = [str(word) for word in command]
@@ -49,7 +49,7 @@ class Person:
         return done.stdout + done.stderr
 
     def loopwright(self, *words: object) -> str:
-        return self.does(sys.executable, "-m", "pipeline", *words)
+        return self.does(sys.executable, "-m", "loopwright.pipeline", *words)
 
     def dvc(self, *words: object) -> str:
         return self.does(sys.executable, "-m", "dvc", *words)
@@ -153,5 +153,5 @@ def test_a_run_on_real_servers_reaches_a_second_clone(around: tuple[Servers, dic
             assert words in line, line
             assert not (second.clone / "again").exists()
     running.stop("scheduler")
-    line = first.mistake("pipeline.engine.start", "design", f"{CASE}-pid")
+    line = first.mistake("loopwright.pipeline.engine.start", "design", f"{CASE}-pid")
     assert variables["DASK_SCHEDULER_ADDRESS"] in line

@@ -21,7 +21,7 @@ from types import ModuleType
 import pytest
 import yaml
 
-import serving
+from loopwright import serving
 
 ROOT = Path(__file__).parents[2]
 RELEASE, MADE = ROOT / "tools" / "release", ROOT / "build" / "release"

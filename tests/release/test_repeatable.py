@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.stages.design import design
-from pipeline.stages.excite import excite
-from pipeline.stages.fit import fit
-from pipeline.stages.paths import TIMING, step_time_file
-from pipeline.stages.validate import validate
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.excite import excite
+from loopwright.pipeline.stages.fit import fit
+from loopwright.pipeline.stages.paths import TIMING, step_time_file
+from loopwright.pipeline.stages.validate import validate
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from reduced import reduced

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import shipped_files
 
-from pipeline.export.gate import GATE_TOLERANCE
-from serving import Controller
+from loopwright.pipeline.export.gate import GATE_TOLERANCE
+from loopwright.serving import Controller
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted(f"{file.parent.name}/{file.stem}" for file in shipped_files.SHIPPED)
@@ -25,7 +25,7 @@ Runs = Mapping[str, Mapping[str, np.ndarray]]
 
 
 def command(*words: str | Path) -> str:
-    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT), "PYTHONNOUSERSITE": "1"}
+    environment = {"PATH": os.environ["PATH"], "PYTHONPATH": str(ROOT / "tools/roots"), "PYTHONNOUSERSITE": "1"}
     done = subprocess.run([*map(str, words)], capture_output=True, text=True, cwd=ROOT, env=environment, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout

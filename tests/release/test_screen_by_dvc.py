@@ -14,15 +14,15 @@ import pytest
 import yaml
 from dirty_plant import cells, clean, write
 
-from pipeline.__main__ import main
-from pipeline.config.exports import screened_record
-from pipeline.engine.dvc import COMMAND
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.config.exports import screened_record
+from loopwright.pipeline.engine.dvc import COMMAND
 
 ROOT = Path(__file__).parents[2]
 ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]=300..700"]
 FIT = "fit@tank-identified"
 # The sources in the present folder, and one worker: each loads its libraries for seconds.
-OWN = {"DVC_NO_ANALYTICS": "1", "PYTHONPATH": "", "LOOPWRIGHT_WORKERS": "1"}
+OWN = {"DVC_NO_ANALYTICS": "1", "PYTHONPATH": str(ROOT / "tools/roots"), "LOOPWRIGHT_WORKERS": "1"}
 
 
 def dvc(*arguments: str) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.report.identified_model import answers_after
+from loopwright.pipeline.report.identified_model import answers_after
 
 EVERY = [1, 2, 16]  # periods between two points of a response
 

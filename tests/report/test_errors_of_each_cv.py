@@ -10,15 +10,15 @@ import pytest
 from own_cases import controllers_of_a_lag, two_lags
 from rich.console import Console
 
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
-from pipeline.evaluation.validation import FILE
-from pipeline.evaluation.verdicts import PLAIN
-from pipeline.report.for_programs import validation
-from pipeline.report.page import headline
-from pipeline.report.results import show_results
-from pipeline.report.verdicts import judge
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
+from loopwright.pipeline.evaluation.validation import FILE
+from loopwright.pipeline.evaluation.verdicts import PLAIN
+from loopwright.pipeline.report.for_programs import validation
+from loopwright.pipeline.report.page import headline
+from loopwright.pipeline.report.results import show_results
+from loopwright.pipeline.report.verdicts import judge
 
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")
 

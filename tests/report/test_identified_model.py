@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from own_cases import two_lags
 
-from pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, ModelSection, model_section
+from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, ModelSection, model_section
 
 
 def gain(sign: str, varies: float | None, rate: bool = False) -> dict[str, Any]:

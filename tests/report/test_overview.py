@@ -15,15 +15,15 @@ from jinja2 import DictLoader
 from markupsafe import Markup
 from rich.console import Console
 
-from pipeline.engine.command import run_stage
-from pipeline.errors import PipelineError
-from pipeline.evaluation.standing import Standing, tally
-from pipeline.evaluation.validation import SCHEMA
-from pipeline.report import templating
-from pipeline.report.overview import write_overview
-from pipeline.report.results import show_results
-from pipeline.report.templating import render
-from pipeline.stages.overview import overview
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.evaluation.standing import Standing, tally
+from loopwright.pipeline.evaluation.validation import SCHEMA
+from loopwright.pipeline.report import templating
+from loopwright.pipeline.report.overview import write_overview
+from loopwright.pipeline.report.results import show_results
+from loopwright.pipeline.report.templating import render
+from loopwright.pipeline.stages.overview import overview
 
 
 def verdict(what: str, holds: bool | None, because: str = "") -> dict[str, Any]:
@@ -238,7 +238,7 @@ def test_what_cannot_be_read_is_one_clear_error(artifacts: Path, tmp_path: Path)
 
 def test_the_overview_needs_no_heavy_import() -> None:
     heavy = "{'torch', 'mlflow', 'onnxruntime', 'casadi', 'scipy', 'matplotlib', 'pandas'}"
-    code = f"import sys, pipeline.stages.overview; print({heavy} & set(sys.modules))"
+    code = f"import sys, loopwright.pipeline.stages.overview; print({heavy} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert found.stdout.strip() == "set()"
 

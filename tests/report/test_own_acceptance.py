@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 from own_cases import controllers_of_a_lag
 
-from pipeline.cases.own_plant import OwnCase
-from pipeline.evaluation.closed_loop import FAR
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
-from pipeline.evaluation.validation import Statement
-from pipeline.evaluation.verdicts import PLAIN
-from pipeline.report.own_acceptance import own_acceptance
-from pipeline.report.page import headline, over_old_loop
-from pipeline.report.verdicts import acceptance
-from pipeline.report.worse import against, beyond_reach, shipped_laws, worse_tests, worst_test
+from loopwright.pipeline.cases.own_plant import OwnCase
+from loopwright.pipeline.evaluation.closed_loop import FAR
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
+from loopwright.pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.verdicts import PLAIN
+from loopwright.pipeline.report.own_acceptance import own_acceptance
+from loopwright.pipeline.report.page import headline, over_old_loop
+from loopwright.pipeline.report.verdicts import acceptance
+from loopwright.pipeline.report.worse import against, beyond_reach, shipped_laws, worse_tests, worst_test
 
 NOISE = 0.01
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")

@@ -17,17 +17,17 @@ import yaml
 from made_up_case import CASE
 from undrawn import draw_nothing
 
-from pipeline.cases import CASES
-from pipeline.errors import ReportError
-from pipeline.evaluation.case import Curve, PaperFigure, Requirement
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.grounds import Grounds
-from pipeline.evaluation.verdicts import PLAIN, close
-from pipeline.optimal import bounds
-from pipeline.report.page import context
-from pipeline.report.templating import render
-from pipeline.report.verdicts import acceptance, judge, requirement, table_row
-from pipeline.stages.report import report
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.errors import ReportError
+from loopwright.pipeline.evaluation.case import Curve, PaperFigure, Requirement
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.verdicts import PLAIN, close
+from loopwright.pipeline.optimal import bounds
+from loopwright.pipeline.report.page import context
+from loopwright.pipeline.report.templating import render
+from loopwright.pipeline.report.verdicts import acceptance, judge, requirement, table_row
+from loopwright.pipeline.stages.report import report
 
 LAWS = ("inc", "incad", "incadec", "pid", "inverse_dob", "forward_dob")
 
@@ -260,7 +260,7 @@ def test_nothing_to_report_is_one_clear_error(tmp_path):
 
 
 def test_the_report_needs_no_heavy_import():
-    code = "import sys, pipeline.stages.report; print({'torch', 'mlflow', 'onnxruntime'} & set(sys.modules))"
+    code = "import sys, loopwright.pipeline.stages.report; print({'torch', 'mlflow', 'onnxruntime'} & set(sys.modules))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert found.stdout.strip() == "set()"
 
@@ -272,7 +272,7 @@ def test_a_partial_file_of_bounds_gives_a_report_that_says_what_is_missing(
     del stored["figures"]["ua"]
     partial = tmp_path / "partial.json"
     partial.write_text(json.dumps(stored))
-    for module in ("pipeline.optimal.bounds", "pipeline.stages.report"):
+    for module in ("loopwright.pipeline.optimal.bounds", "loopwright.pipeline.stages.report"):
         monkeypatch.setattr(f"{module}.bounds_path", lambda case: partial)
     laws = {f"{CASE}-{law}": {"case": CASE, "name": law, "law": law, "model": "one_step"} for law in LAWS}
     case = {"held_out_seeds": list(CASES[CASE].held_out_seeds)}

@@ -15,23 +15,23 @@ from made_up_case import BATCH, PH, Miniature
 from rich.console import Console
 from undrawn import draw_nothing
 
-from pipeline.cases import CASES
-from pipeline.cases.batch_reactor.case import CALMED
-from pipeline.evaluation.case import Curve, Figure, PaperFigure, Requirement
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.metric import METRICS
-from pipeline.evaluation.model_evidence import candidates, model_figure
-from pipeline.evaluation.validation import Validation
-from pipeline.evaluation.verdicts import plain_reason
-from pipeline.pictures.loop_picture import History, summary
-from pipeline.pictures.loop_pictures import info_picture
-from pipeline.pictures.numbers import ratio
-from pipeline.report.for_programs import gate_id
-from pipeline.report.page import headline
-from pipeline.report.results import show_results
-from pipeline.report.verdicts import judge, requirement, table_row
-from pipeline.tracking.card import version_description
-from pipeline.tracking.gate import Gate
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.batch_reactor.case import CALMED
+from loopwright.pipeline.evaluation.case import Curve, Figure, PaperFigure, Requirement
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.metric import METRICS
+from loopwright.pipeline.evaluation.model_evidence import candidates, model_figure
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.evaluation.verdicts import plain_reason
+from loopwright.pipeline.pictures.loop_picture import History, summary
+from loopwright.pipeline.pictures.loop_pictures import info_picture
+from loopwright.pipeline.pictures.numbers import ratio
+from loopwright.pipeline.report.for_programs import gate_id
+from loopwright.pipeline.report.page import headline
+from loopwright.pipeline.report.results import show_results
+from loopwright.pipeline.report.verdicts import judge, requirement, table_row
+from loopwright.pipeline.tracking.card import version_description
+from loopwright.pipeline.tracking.gate import Gate
 
 
 def load(root: Path, mini: Miniature, own_data: bool = False) -> Evidence:

@@ -16,23 +16,23 @@ import pytest
 from made_up_case import Miniature
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
-from pipeline.errors import ReportError
-from pipeline.evaluation.case import Array, Case, Requirement
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.law_evidence import Analysis
-from pipeline.evaluation.metric import Metric
-from pipeline.evaluation.validation import Validation
-from pipeline.evaluation.verdicts import PLAIN
-from pipeline.pictures.drawing import CasePicture
-from pipeline.pictures.loop_pictures import overview_picture
-from pipeline.plants.equations import EquationPlant
-from pipeline.report.figures import draw_all
-from pipeline.report.page import headline, write_report
-from pipeline.report.verdicts import requirement
-from pipeline.simulation.scenario import Scenario, held
-from pipeline.tracking.card import version_description
-from pipeline.tracking.gate import Gate
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from loopwright.pipeline.errors import ReportError
+from loopwright.pipeline.evaluation.case import Array, Case, Requirement
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import Analysis
+from loopwright.pipeline.evaluation.metric import Metric
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.evaluation.verdicts import PLAIN
+from loopwright.pipeline.pictures.drawing import CasePicture
+from loopwright.pipeline.pictures.loop_pictures import overview_picture
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.report.figures import draw_all
+from loopwright.pipeline.report.page import headline, write_report
+from loopwright.pipeline.report.verdicts import requirement
+from loopwright.pipeline.simulation.scenario import Scenario, held
+from loopwright.pipeline.tracking.card import version_description
+from loopwright.pipeline.tracking.gate import Gate
 
 HOLD = 20
 ANALYSIS = {

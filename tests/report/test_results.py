@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pipeline.evaluation.standing import Standing
-from pipeline.report.results import AHEAD, show_results
+from loopwright.pipeline.evaluation.standing import Standing
+from loopwright.pipeline.report.results import AHEAD, show_results
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 
@@ -18,7 +18,7 @@ def test_a_ratio_below_the_bound_has_a_remark_and_no_other(monkeypatch: pytest.M
     """A fresh user saw .64 of what no controller is expected to beat, without a word."""
     said = {}
     for ahead in (AHEAD, 0.0, 1e9):
-        monkeypatch.setattr("pipeline.report.results.AHEAD", ahead)
+        monkeypatch.setattr("loopwright.pipeline.report.results.AHEAD", ahead)
         show_results(ARTIFACTS, Console(file=(terminal := io.StringIO()), width=200))
         said[ahead] = "below 1" in terminal.getvalue()
     standings = [Standing.read(path.parent) for path in ARTIFACTS.glob("*/validation.json")]

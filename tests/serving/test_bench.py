@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from serving import Controller
-from serving import bench as module
-from serving.bench import Timing, bench, table
+from loopwright.serving import Controller
+from loopwright.serving import bench as module
+from loopwright.serving.bench import Timing, bench, table
 
 pytest_plugins = ["small_laws"]
 

@@ -11,10 +11,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from serving import Controller
-from serving.journal import Journal, JournalReader, Scan, columns
-from serving.page.trend import trend
-from serving.station.export import export
+from loopwright.serving import Controller
+from loopwright.serving.journal import Journal, JournalReader, Scan, columns
+from loopwright.serving.page.trend import trend
+from loopwright.serving.station.export import export
 
 pytest_plugins = ["small_laws"]
 

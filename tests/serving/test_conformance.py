@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kits import OLD
 
-from serving import Controller, LoopwrightError
-from serving.__main__ import main
-from serving.conformance.check import check
-from serving.conformance.kit import PASS, VECTORS, write_kit
-from serving.conformance.numbers import read, written
+from loopwright.serving import Controller, LoopwrightError
+from loopwright.serving.__main__ import main
+from loopwright.serving.conformance.check import check
+from loopwright.serving.conformance.kit import PASS, VECTORS, write_kit
+from loopwright.serving.conformance.numbers import read, written
 
 pytest_plugins = ["small_laws"]
 Capture = pytest.CaptureFixture[str]

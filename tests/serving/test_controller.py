@@ -26,12 +26,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
-from pipeline.laws import ControlLaw
-from serving import ArtifactError, ContractError, Controller, Manifest, SampleError, Signal, step_lock
-from serving.digest import TRAILER_BYTES, seal
-from serving.errors import OutputError
-from serving.graph_audit import audit
-from serving.manifest import MANIFEST_KEY
+from loopwright.pipeline.laws import ControlLaw
+from loopwright.serving import ArtifactError, ContractError, Controller, Manifest, SampleError, Signal, step_lock
+from loopwright.serving.digest import TRAILER_BYTES, seal
+from loopwright.serving.errors import OutputError
+from loopwright.serving.graph_audit import audit
+from loopwright.serving.manifest import MANIFEST_KEY
 
 pytest_plugins = ["small_laws"]
 FEED: dict[str, Any] = {"sp": 1.0, "pv": [0.8, 300.0], "mv_applied": [40.0], "state": [1.0, 0.1]}
@@ -271,7 +271,7 @@ def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
 
 LOADS = """
 import sys
-from serving import ArtifactError, Controller
+from loopwright.serving import ArtifactError, Controller
 for path in sys.argv[1:]:
     try:
         Controller(path)

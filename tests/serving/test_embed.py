@@ -14,9 +14,9 @@ import pytest
 from kits import DAMAGES, OLD, kit_of, spoilt, verdict_on
 from shipped_files import SHIPPED
 
-from pipeline.export.gate import export
-from pipeline.laws import ControlLaw
-from serving import Controller
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws import ControlLaw
+from loopwright.serving import Controller
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples" / "embed" / "python"
@@ -35,12 +35,12 @@ for file in files:
             print(file, file=sys.stderr)
             raise
     said[file] = out.getvalue()
-print(json.dumps({"said": said, "ours": "serving" in sys.modules}))
+print(json.dumps({"said": said, "ours": "loopwright" in sys.modules}))
 """
 
 
 def run(example: str, file: Path) -> str:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
     command = [sys.executable, "-W", "error", str(EXAMPLES / example), str(file)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == 0, done.stderr
@@ -67,7 +67,7 @@ def said() -> dict[str, dict[str, str]]:
     """What two examples print, by example and file: a process for each file would load the libraries 72 times."""
     found = {}
     for example in ("python_runtime.py", "plain_onnxruntime.py"):
-        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
         command = [sys.executable, "-W", "error", "-c", MANY, str(EXAMPLES / example), *map(str, SHIPPED)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, env=environment)
         assert done.returncode == 0, done.stderr
@@ -113,7 +113,7 @@ def test_python_s_conformance_run_passes_the_kit_and_no_damaged_one(damage: str 
     file = next(f for f in SHIPPED if f.parent.name == "jacketed_batch_reactor")  # one of its MVs is discrete
     kit = kit_of(file) if damage is None else spoilt(file, tmp_path, DAMAGES[damage])
     command = [sys.executable, str(EXAMPLES / "conformance.py"), str(kit), str(tmp_path / "answers.json")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == (damage is not None), done.stderr
     verdict = verdict_on(file, tmp_path / "answers.json")
@@ -124,14 +124,14 @@ def test_python_s_conformance_run_passes_the_kit_and_no_damaged_one(damage: str 
 @pytest.mark.parametrize("version", OLD)
 def test_python_s_conformance_run_reads_an_old_kit(version: int, tmp_path: Path) -> None:
     kit = spoilt(SHIPPED[0], tmp_path, OLD[version])
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
     command = [sys.executable, str(EXAMPLES / "conformance.py"), str(kit)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_the_example_loop_runs_once_a_period_and_begins_where_the_plant_is() -> None:
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
     file = ROOT / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
     command = [sys.executable, "-W", "error", str(EXAMPLES / "control_loop.py"), str(file), "20", "0.05"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)

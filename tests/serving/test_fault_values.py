@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from serving import Controller, ControlLoop, EndpointError, Fresh, InRange, Mode, Rate, Sample, Signal
-from serving.fault import Fault, kind_of, lasting, reworded, told_by
-from serving.journal import Journal
-from serving.station.recorder import Recorder
+from loopwright.serving import Controller, ControlLoop, EndpointError, Fresh, InRange, Mode, Rate, Sample, Signal
+from loopwright.serving.fault import Fault, kind_of, lasting, reworded, told_by
+from loopwright.serving.journal import Journal
+from loopwright.serving.station.recorder import Recorder
 
 pytest_plugins = ["small_laws"]
 TAGS = tuple(Signal(name, "K", 0.0, 100.0) for name in ("TIC-101", "TIC 102", "3"))

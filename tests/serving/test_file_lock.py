@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from serving.errors import LoopError
-from serving.file_lock import LockTakenError, locked
-from serving.journal import Journal
-from serving.station.lease import Lease
+from loopwright.serving.errors import LoopError
+from loopwright.serving.file_lock import LockTakenError, locked
+from loopwright.serving.journal import Journal
+from loopwright.serving.station.lease import Lease
 
 NODE, ENDPOINT = "ns=2;s=MV.u", "opc.tcp://127.0.0.1:4841"
 

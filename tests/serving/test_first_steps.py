@@ -14,8 +14,8 @@ import pytest
 from killers import blind_children, killer
 from shipped_files import SHIPPED
 
-from serving import ArtifactError, Controller, OutputError, SignatureError, first_steps
-from serving.first_steps import take, tried
+from loopwright.serving import ArtifactError, Controller, OutputError, SignatureError, first_steps
+from loopwright.serving.first_steps import take, tried
 
 pytest_plugins = ["small_laws"]
 
@@ -57,7 +57,7 @@ def fails(error: Exception) -> Callable[..., Any]:
 def test_nothing_is_imported_from_the_folder_in_which_somebody_stands(
     pi_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("numpy", "signal", "serving"):
+    for module in ("numpy", "signal", "loopwright"):
         (tmp_path / f"{module}.py").write_text("open('ran', 'w').close()\nraise SystemExit('hijacked')\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("PYTHONPATH", raising=False)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.export.gate import export
-from pipeline.plants.signals import Signals
-from serving import (
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving import (
     ContractError,
     Controller,
     ControlLoop,
@@ -25,9 +25,9 @@ from serving import (
     Signal,
     default_guards,
 )
-from serving.fitted import Fitted, fitted
-from serving.journal import columns
-from serving.trust import signer
+from loopwright.serving.fitted import Fitted, fitted
+from loopwright.serving.journal import columns
+from loopwright.serving.trust import signer
 
 pytest_plugins = ["small_laws"]
 

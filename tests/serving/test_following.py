@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from serving import Controller, ControlLoop, Mode, Sample, Signal
-from serving.monitor import Monitor
-from serving.monitor.following import Following
+from loopwright.serving import Controller, ControlLoop, Mode, Sample, Signal
+from loopwright.serving.monitor import Monitor
+from loopwright.serving.monitor.following import Following
 
 pytest_plugins = ["small_laws"]
 

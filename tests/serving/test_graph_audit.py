@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 from shipped_files import SHIPPED
 
-from serving import ArtifactError
-from serving.graph_audit import MAX_NODES, MAX_OPSET, MIN_OPSET, audit, graph_values
-from serving.graph_operators import SIGNATURES
-from serving.graph_work import MAX_WORK, RULES
-from serving.onnx_bytes import SCHEMA, read_model
+from loopwright.serving import ArtifactError
+from loopwright.serving.graph_audit import MAX_NODES, MAX_OPSET, MIN_OPSET, audit, graph_values
+from loopwright.serving.graph_operators import SIGNATURES
+from loopwright.serving.graph_work import MAX_WORK, RULES
+from loopwright.serving.onnx_bytes import SCHEMA, read_model
 
 by_name = pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
 

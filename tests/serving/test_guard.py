@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from serving import (
+from loopwright.serving import (
     Allowed,
     Complete,
     Fresh,
@@ -24,7 +24,7 @@ from serving import (
     Signal,
     default_guards,
 )
-from serving.fault import lasting
+from loopwright.serving.fault import lasting
 
 PV = (Signal("level", "m", 0.0, 2.0), Signal("T", "K", 250.0, 400.0))
 MANIFEST = Manifest(

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.__main__ import main
-from serving.journal import Event, Journal
+from loopwright.pipeline.__main__ import main
+from loopwright.serving.journal import Event, Journal
 
 BEGIN = 1_772_323_200.0  # 2026-03-01 00:00 UTC
 EVENTS = [

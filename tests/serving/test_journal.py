@@ -21,16 +21,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import within
 
-from serving import Controller, LoopError
-from serving.journal import Event, Journal, JournalReader, Scan, columns, writer
-from serving.journal.entries import Kind
-from serving.journal.file import TABLES
-from serving.journal.packing import packed, unpacked
-from serving.journal.reader import EVENT
-from serving.journal.rotation import LEAST_EVENTS, SLACK, shorten_events
-from serving.journal.writer import BLOCK, FRESH
-from serving.page import metrics
-from serving.station.recorder import Recorder
+from loopwright.serving import Controller, LoopError
+from loopwright.serving.journal import Event, Journal, JournalReader, Scan, columns, writer
+from loopwright.serving.journal.entries import Kind
+from loopwright.serving.journal.file import TABLES
+from loopwright.serving.journal.packing import packed, unpacked
+from loopwright.serving.journal.reader import EVENT
+from loopwright.serving.journal.rotation import LEAST_EVENTS, SLACK, shorten_events
+from loopwright.serving.journal.writer import BLOCK, FRESH
+from loopwright.serving.page import metrics
+from loopwright.serving.station.recorder import Recorder
 
 pytest_plugins = ["small_laws"]
 
@@ -188,7 +188,7 @@ def test_a_second_writer_is_refused_and_the_first_goes_on(tmp_path: Path, contro
     for name in (path, link):
         with pytest.raises(LoopError, match=rf"{name.name} is written by another loop \(process {os.getpid()}\); end"):
             Journal(name)
-    script = "import sys; from pathlib import Path; from serving.journal import Journal; Journal(Path(sys.argv[1]))"
+    script = "import pathlib, sys, loopwright.serving.journal as j; j.Journal(pathlib.Path(sys.argv[1]))"
     other = subprocess.run([sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=False)
     assert other.returncode == 1
     assert f"{path} is written by another loop (process {os.getpid()})" in other.stderr

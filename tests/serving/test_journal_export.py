@@ -9,10 +9,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pipeline.historian.tags import read_tags
-from serving import Controller, Signal
-from serving.journal import Journal, Scan, columns
-from serving.station.export import export, tag_table
+from loopwright.pipeline.historian.tags import read_tags
+from loopwright.serving import Controller, Signal
+from loopwright.serving.journal import Journal, Scan, columns
+from loopwright.serving.station.export import export, tag_table
 
 pytest_plugins = ["small_laws"]
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from serving import Controller
-from serving.journal import JournalReader
+from loopwright.serving import Controller
+from loopwright.serving.journal import JournalReader
 
 pytest_plugins = ["small_laws"]
 
@@ -27,8 +27,8 @@ PAUSE_S = 0.1  # a process that gives a scan each millisecond did not run for lo
 WRITER = """
 import os, signal, sys, time
 from pathlib import Path
-from serving import Manifest
-from serving.journal import Event, Journal, Scan, rotation, writer
+from loopwright.serving import Manifest
+from loopwright.serving.journal import Event, Journal, Scan, rotation, writer
 path, manifest, small = Path(sys.argv[1]), Manifest.from_json(sys.argv[2]), sys.argv[3] == "small"
 if small:
     writer.BLOCK, writer.FRESH, writer.FLUSH_S, rotation.LEAST_EVENTS = 20, 40, 0.02, 60

@@ -18,11 +18,11 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from plant_servers import RunningLoop, free_port, loop_toml
 from processes import within
 
-from serving import Mode
-from serving.opcua.certificates import make
-from serving.opcua.link import Link
-from serving.opcua.settings import Server as ServerSettings
-from serving.station.settings import Hold, Settings
+from loopwright.serving import Mode
+from loopwright.serving.opcua.certificates import make
+from loopwright.serving.opcua.link import Link
+from loopwright.serving.opcua.settings import Server as ServerSettings
+from loopwright.serving.station.settings import Hold, Settings
 
 SPACE = "urn:loopwright:plant"
 GRANTED_S = 4.0  # of a session and of a channel, which are renewed a second before: a busy machine needs some

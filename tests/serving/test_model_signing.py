@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from signing_parts import NOW
 
-from serving import Controller, SignatureError
-from serving.signing.keys import PrivateKey, PublicKey
-from serving.signing.sign import sign
-from serving.signing.verify import signature_of, verified
+from loopwright.serving import Controller, SignatureError
+from loopwright.serving.signing.keys import PrivateKey, PublicKey
+from loopwright.serving.signing.sign import sign
+from loopwright.serving.signing.verify import signature_of, verified
 
 pytest_plugins = ["small_laws", "signed_files"]
 pytestmark = pytest.mark.skipif(find_spec("model_signing") is None, reason="model-signing is not installed: make setup")

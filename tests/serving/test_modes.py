@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from serving import Controller, ControlLoop, LoopError, Mode, Sample, VirtualClock
+from loopwright.serving import Controller, ControlLoop, LoopError, Mode, Sample, VirtualClock
 
 pytest_plugins = ["small_laws"]
 
@@ -62,7 +62,7 @@ def test_the_traceback_of_an_endpoint_can_be_had(pi_file: Path, caplog: pytest.L
             return Sample(pv=np.array([readings["level"]]))
 
     readings: dict[str, float] = {}
-    with caplog.at_level(logging.DEBUG, logger="serving.loop"):
+    with caplog.at_level(logging.DEBUG, logger="loopwright.serving.loop"):
         loop_on(Mistaken(), pi_file, Mode.AUTO).run(1)
     assert [r.getMessage() for r in caplog.records] == ["the endpoint's read failed"]
     assert 'in read\n    return Sample(pv=np.array([readings["level"]]))' in caplog.text

@@ -14,15 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from serving import Command, Controller, Manifest, Mode, Sample, Signal
-from serving.monitor import Monitor
-from serving.monitor.answers import Answers
-from serving.monitor.chart import Chart, correlation, run_limit, upper_scatter
-from serving.monitor.error import Swing, harris_index
-from serving.monitor.pace import dead_times, settle_scans
-from serving.monitor.plight import Plight
-from serving.monitor.residual import Foresight
-from serving.monitor.rest import RestMap
+from loopwright.serving import Command, Controller, Manifest, Mode, Sample, Signal
+from loopwright.serving.monitor import Monitor
+from loopwright.serving.monitor.answers import Answers
+from loopwright.serving.monitor.chart import Chart, correlation, run_limit, upper_scatter
+from loopwright.serving.monitor.error import Swing, harris_index
+from loopwright.serving.monitor.pace import dead_times, settle_scans
+from loopwright.serving.monitor.plight import Plight
+from loopwright.serving.monitor.residual import Foresight
+from loopwright.serving.monitor.rest import RestMap
 
 pytest_plugins = ["small_laws"]
 

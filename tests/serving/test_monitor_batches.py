@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from serving import Command, Manifest, Mode, Sample, Signal
-from serving.monitor import Monitor
+from loopwright.serving import Command, Manifest, Mode, Sample, Signal
+from loopwright.serving.monitor import Monitor
 
 SP = (Signal("T", "degC", 0.0, 100.0),)
 MV = (Signal("u", "%", 0.0, 100.0),)

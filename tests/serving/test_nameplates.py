@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 from asyncua import ua
 
-from serving import Controller
-from serving.errors import EndpointError
-from serving.journal import Journal
-from serving.manifest import Manifest
-from serving.opcua.ages import Ages
-from serving.opcua.answers import BusyError, LateError
-from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.link import node_id
-from serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity, others_since
-from serving.opcua.plan import Plan
-from serving.opcua.sampling import Sampling, Values
-from serving.opcua.settings import ModeNode, Nodes, Point, Server
-from serving.opcua.values import Reading
-from serving.station.beginning import keep_namespaces, keep_nodes, namespaces_before, nodes_before
-from serving.station.wishes import Wishes
+from loopwright.serving import Controller
+from loopwright.serving.errors import EndpointError
+from loopwright.serving.journal import Journal
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.opcua.ages import Ages
+from loopwright.serving.opcua.answers import BusyError, LateError
+from loopwright.serving.opcua.endpoint import OpcUaEndpoint
+from loopwright.serving.opcua.link import node_id
+from loopwright.serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity, others_since
+from loopwright.serving.opcua.plan import Plan
+from loopwright.serving.opcua.sampling import Sampling, Values
+from loopwright.serving.opcua.settings import ModeNode, Nodes, Point, Server
+from loopwright.serving.opcua.values import Reading
+from loopwright.serving.station.beginning import keep_namespaces, keep_nodes, namespaces_before, nodes_before
+from loopwright.serving.station.wishes import Wishes
 
 pytest_plugins = ["small_laws"]
 UA_SPACE = "http://opcfoundation.org/UA/"

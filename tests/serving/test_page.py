@@ -19,12 +19,12 @@ import pytest
 from fake_loop import BEGIN, Browser, FakeLoop, opened
 from processes import lives, within
 
-from serving import Controller, LoopError
-from serving.journal import Event, Journal, JournalReader, Scan
-from serving.page.live import Live
-from serving.page.process import PageProcess
-from serving.page.settings import Page
-from serving.page.trend import Modes, Thinned, trend
+from loopwright.serving import Controller, LoopError
+from loopwright.serving.journal import Event, Journal, JournalReader, Scan
+from loopwright.serving.page.live import Live
+from loopwright.serving.page.process import PageProcess
+from loopwright.serving.page.settings import Page
+from loopwright.serving.page.trend import Modes, Thinned, trend
 
 pytest_plugins = ["small_laws"]
 
@@ -234,8 +234,8 @@ def _answers(browser: Browser) -> bool:
 OWNER = """
 import sys
 from pathlib import Path
-from serving.page.process import PageProcess
-from serving.page.settings import Page
+from loopwright.serving.page.process import PageProcess
+from loopwright.serving.page.settings import Page
 page = PageProcess(Page("127.0.0.1:0"), Path(sys.argv[1]), Path(sys.argv[2]), print)
 print(page._process.pid, flush=True)
 sys.stdin.read()

@@ -19,10 +19,10 @@ from fake_loop import Browser, FakeLoop, opened
 from page_requests import BODY, broken, whole
 from processes import within
 
-from serving import Controller
-from serving.page import app as page_app
-from serving.page import live, patience
-from serving.page.app import PageApp
+from loopwright.serving import Controller
+from loopwright.serving.page import app as page_app
+from loopwright.serving.page import live, patience
+from loopwright.serving.page.app import PageApp
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr"
 

@@ -10,9 +10,9 @@ from typing import TypeAlias
 
 import pytest
 
-import serving.page
+import loopwright.serving.page
 
-CSS = (Path(serving.page.__file__).parent / "static" / "page.css").read_text()
+CSS = (Path(loopwright.serving.page.__file__).parent / "static" / "page.css").read_text()
 WORDS, SHAPES = 4.5, 3.0  # WCAG AA
 
 Colour: TypeAlias = tuple[float, float, float]

@@ -10,13 +10,13 @@ from typing import Any, Literal
 import pytest
 from shipped_files import SHIPPED
 
-from serving import ArtifactError, Controller, LoopError
-from serving.digest import file_digest
-from serving.fields import parse
-from serving.manifest import MAX_CHARACTERS, Manifest, strictly
-from serving.plain_values import LONGEST_SHOWN, MAX_DIGITS, refused, shown
-from serving.sidecar import difference, sidecar
-from serving.station.settings import Settings
+from loopwright.serving import ArtifactError, Controller, LoopError
+from loopwright.serving.digest import file_digest
+from loopwright.serving.fields import parse
+from loopwright.serving.manifest import MAX_CHARACTERS, Manifest, strictly
+from loopwright.serving.plain_values import LONGEST_SHOWN, MAX_DIGITS, refused, shown
+from loopwright.serving.sidecar import difference, sidecar
+from loopwright.serving.station.settings import Settings
 
 LONG = 16**5001
 DEEP: list[Any] = []

@@ -19,10 +19,10 @@ from plant_servers import CASE, Plant, RunningLoop, Wire
 from processes import within
 from served_plant import PERIOD_S, SPEED, begun, cut, mend, read, served, wired, write  # noqa: F401
 
-from serving import Command, Mode
-from serving.journal import Scan
-from serving.opcua.certificates import make
-from serving.standing import SAME
+from loopwright.serving import Command, Mode
+from loopwright.serving.journal import Scan
+from loopwright.serving.opcua.certificates import make
+from loopwright.serving.standing import SAME
 
 START = 250.0  # the MV of the plant's start
 

@@ -9,9 +9,9 @@ from plant_servers import SPACE, UNKNOWN, Plant, RunningLoop, Wire
 from processes import within
 from served_plant import MODE, RECOVER, begun, read, served, wired, write  # noqa: F401
 
-from serving import Mode
-from serving.opcua.settings import HandBack
-from serving.station.settings import Hold
+from loopwright.serving import Mode
+from loopwright.serving.opcua.settings import HandBack
+from loopwright.serving.station.settings import Hold
 
 
 def test_an_mv_node_of_another_type_is_not_written_while_it_is(plant: Plant, wire: Wire, tmp_path: Path) -> None:

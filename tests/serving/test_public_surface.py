@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 
-import serving
+from loopwright import serving
 
 SURFACE = {
     "Allowed", "ArtifactError", "Clock", "Command", "Complete", "ContractError", "ControlLoop", "Controller",
@@ -25,7 +25,7 @@ def test_every_public_name_is_documented() -> None:
         value = getattr(serving, name)
         assert inspect.getdoc(value), name
         for member, function in inspect.getmembers(value, inspect.isfunction):
-            if not member.startswith("_") and function.__module__.startswith("serving"):
+            if not member.startswith("_") and function.__module__.startswith("loopwright.serving"):
                 assert inspect.getdoc(function), f"{name}.{member}"
 
 

@@ -12,20 +12,20 @@ import pandas as pd
 import pytest
 from asyncua import ua
 
-from serving import Controller, EndpointError, Sample, VirtualClock
-from serving.journal import JournalReader
-from serving.opcua.ages import Ages
-from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.plan import Plan
-from serving.opcua.sampling import Sampling, Values
-from serving.opcua.settings import Nodes, Server
-from serving.opcua.values import Reading
-from serving.station import station
-from serving.station.export import export
-from serving.station.lease import Lease
-from serving.station.settings import JournalSettings, Settings
-from serving.station.station import Station
-from serving.station.views import state
+from loopwright.serving import Controller, EndpointError, Sample, VirtualClock
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.opcua.ages import Ages
+from loopwright.serving.opcua.endpoint import OpcUaEndpoint
+from loopwright.serving.opcua.plan import Plan
+from loopwright.serving.opcua.sampling import Sampling, Values
+from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.opcua.values import Reading
+from loopwright.serving.station import station
+from loopwright.serving.station.export import export
+from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.settings import JournalSettings, Settings
+from loopwright.serving.station.station import Station
+from loopwright.serving.station.views import state
 
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
 NODES: dict[str, Any] = {"pv": {"C_A": "ns=2;s=a", "T": "ns=2;s=b"}, "mv": {"T_j": "ns=2;s=c"}}

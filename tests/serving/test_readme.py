@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import serving.loop
-from pipeline.plants.equations import EquationPlant
-from serving import VirtualClock
+import loopwright.serving.loop
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.serving import VirtualClock
 
 ROOT = Path(__file__).resolve().parents[2]
 BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
@@ -36,7 +36,7 @@ def test_the_examples_hold_the_set_point(block: str, plant: EquationPlant, monke
         "write_plant": write_plant,
     }
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(serving.loop, "MonotonicClock", VirtualClock)
+    monkeypatch.setattr(loopwright.serving.loop, "MonotonicClock", VirtualClock)
     with pytest.raises(KeyboardInterrupt):
         exec(block, plants)
     assert plant.measure(x)[0] == pytest.approx(0.6661, abs=1e-3)

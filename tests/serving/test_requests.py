@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from serving import Controller, ControlLoop, LoopError, Mode
-from serving.proof import Proof, judged
-from serving.sidecar import manifest_in
-from serving.station.requests import Change, Request, change
+from loopwright.serving import Controller, ControlLoop, LoopError, Mode
+from loopwright.serving.proof import Proof, judged
+from loopwright.serving.sidecar import manifest_in
+from loopwright.serving.station.requests import Change, Request, change
 
 FILE = Path(__file__).parents[2] / "artifacts" / "jacketed_batch_reactor" / "fuzzy_feedforward_observer.onnx"
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from serving import Controller, LoopError
-from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.sampling import Sampling
-from serving.opcua.settings import Nodes, Server
+from loopwright.serving import Controller, LoopError
+from loopwright.serving.opcua.endpoint import OpcUaEndpoint
+from loopwright.serving.opcua.sampling import Sampling
+from loopwright.serving.opcua.settings import Nodes, Server
 
 pytest_plugins = ["small_laws"]
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from asyncua import ua
 
-from serving import Controller, ControlLoop, EndpointError, LoopError, Mode, VirtualClock
-from serving.opcua.endpoint import OpcUaEndpoint
-from serving.opcua.sampling import Values
-from serving.opcua.settings import HandBack, Nodes, Server
+from loopwright.serving import Controller, ControlLoop, EndpointError, LoopError, Mode, VirtualClock
+from loopwright.serving.opcua.endpoint import OpcUaEndpoint
+from loopwright.serving.opcua.sampling import Values
+from loopwright.serving.opcua.settings import HandBack, Nodes, Server
 
 pytest_plugins = ["small_laws"]
 

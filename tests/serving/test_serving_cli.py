@@ -1,4 +1,4 @@
-"""``python -m serving``: a card that a person can read, JSON for programs, one line for an error."""
+"""``python -m loopwright.serving``: a card that a person can read, JSON for programs, one line for an error."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.export.controller_file import with_evidence
-from serving import ArtifactError, Controller, Manifest
-from serving.__main__ import main
-from serving.station import command
-from serving.station.template import template
-from serving.words import harmless, plain
+from loopwright.pipeline.export.controller_file import with_evidence
+from loopwright.serving import ArtifactError, Controller, Manifest
+from loopwright.serving.__main__ import main
+from loopwright.serving.station import command
+from loopwright.serving.station.template import template
+from loopwright.serving.words import harmless, plain
 
 pytest_plugins = ["small_laws"]
 Capture = pytest.CaptureFixture[str]

@@ -13,12 +13,12 @@ from fake_loop import Browser
 from plant_servers import RunningLoop
 from processes import within
 
-from pipeline.__main__ import main
-from serving import LoopError
-from serving.page.candidates import candidates
-from serving.station.control import ask
-from serving.station.settings import Settings
-from serving.trust import signer
+from loopwright.pipeline.__main__ import main
+from loopwright.serving import LoopError
+from loopwright.serving.page.candidates import candidates
+from loopwright.serving.station.control import ask
+from loopwright.serving.station.settings import Settings
+from loopwright.serving.trust import signer
 
 pytest_plugins = ["signed_files", "signed_loop"]
 

@@ -21,14 +21,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from signing_parts import DAY_AFTER, NOW, edit_bundle, payload_of, sign_payload
 
-from pipeline.__main__ import main as loopwright
-from pipeline.export.controller_file import with_evidence
-from serving import ArtifactError, SignatureError
-from serving.digest import file_digest
-from serving.signing import bundle
-from serving.signing.keys import PrivateKey, PublicKey, make_pair
-from serving.signing.sign import sign
-from serving.signing.verify import Signed, signature_of, verified
+from loopwright.pipeline.__main__ import main as loopwright
+from loopwright.pipeline.export.controller_file import with_evidence
+from loopwright.serving import ArtifactError, SignatureError
+from loopwright.serving.digest import file_digest
+from loopwright.serving.signing import bundle
+from loopwright.serving.signing.keys import PrivateKey, PublicKey, make_pair
+from loopwright.serving.signing.sign import sign
+from loopwright.serving.signing.verify import Signed, signature_of, verified
 
 pytest_plugins = ["small_laws", "signed_files"]
 many = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

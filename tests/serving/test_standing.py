@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from serving import (
+from loopwright.serving import (
     Command,
     Controller,
     ControlLoop,
@@ -23,7 +23,7 @@ from serving import (
     Signal,
     VirtualClock,
 )
-from serving.standing import SAME, SETTLED, Standing
+from loopwright.serving.standing import SAME, SETTLED, Standing
 
 pytest_plugins = ["small_laws"]
 RANGE = 100.0

@@ -17,19 +17,19 @@ import numpy as np
 import pytest
 from processes import within as in_time
 
-from serving import ArtifactError, Controller, Mode, MonotonicClock, Sample, VirtualClock
-from serving.journal import JournalReader
-from serving.loop import Command, within
-from serving.opcua.nameplates import Identity
-from serving.opcua.sampling import Values
-from serving.opcua.settings import Nodes, Server
-from serving.station import station
-from serving.station.beginning import another_before, namespaces_before
-from serving.station.command import _Lines
-from serving.station.lease import Lease
-from serving.station.settings import Hold, JournalSettings, Settings
-from serving.station.station import Station
-from serving.station.views import state
+from loopwright.serving import ArtifactError, Controller, Mode, MonotonicClock, Sample, VirtualClock
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.loop import Command, within
+from loopwright.serving.opcua.nameplates import Identity
+from loopwright.serving.opcua.sampling import Values
+from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.station import station
+from loopwright.serving.station.beginning import another_before, namespaces_before
+from loopwright.serving.station.command import _Lines
+from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.settings import Hold, JournalSettings, Settings
+from loopwright.serving.station.station import Station
+from loopwright.serving.station.views import state
 
 PID = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
 NODES: dict[str, Any] = {"pv": {"C_A": "ns=2;s=a", "T": "ns=2;s=b"}, "mv": {"T_j": "ns=2;s=c"}}

@@ -22,14 +22,14 @@ from killers import blind_children, killer
 from plant_servers import UNKNOWN, Plant, RunningLoop, spoil
 from processes import within
 
-from pipeline.__main__ import main
-from pipeline.export.gate import export
-from pipeline.plants.signals import Signals
-from serving import Controller, LoopError, Mode
-from serving.journal import JournalReader
-from serving.journal.reader import Entry
-from serving.page.candidates import candidates
-from serving.station.control import ask
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.serving import Controller, LoopError, Mode
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.journal.reader import Entry
+from loopwright.serving.page.candidates import candidates
+from loopwright.serving.station.control import ask
 
 pytest_plugins = ["small_laws"]
 ARTIFACTS = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr"

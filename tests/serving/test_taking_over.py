@@ -11,11 +11,21 @@ import numpy as np
 import pytest
 from shipped_files import SHIPPED
 
-from pipeline.cases import CASES
-from pipeline.export.gate import export
-from pipeline.laws import LAWS
-from serving import Controller, ControlLoop, EndpointError, Fallback, LoopError, Mode, Sample, Signal, VirtualClock
-from serving.transfer import Transfer
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws import LAWS
+from loopwright.serving import (
+    Controller,
+    ControlLoop,
+    EndpointError,
+    Fallback,
+    LoopError,
+    Mode,
+    Sample,
+    Signal,
+    VirtualClock,
+)
+from loopwright.serving.transfer import Transfer
 
 pytest_plugins = ["small_laws"]
 PERIOD = 0.5
@@ -296,7 +306,7 @@ def fast(law: Any, sp: Any, pv: Any, dv: Any, mv_applied: Any, state: Any) -> An
 
 @pytest.fixture(scope="session")
 def fast_file(make_formula: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from pipeline.export.gate import export
+    from loopwright.pipeline.export.gate import export
 
     path = tmp_path_factory.mktemp("controller") / "fast.onnx"
     export(make_formula(fast), path, case="tank", provenance={})
@@ -393,7 +403,7 @@ def test_others_that_do_not_fit_are_named(
 ) -> None:
     from small_laws import SIGNALS
 
-    from pipeline.plants.signals import Signals
+    from loopwright.pipeline.plants.signals import Signals
 
     others = {
         "its period is 1 s, the loop's is 0.5 s": replace(SIGNALS, period_s=1.0),

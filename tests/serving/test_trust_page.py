@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.__main__ import main
-from pipeline.tracking import signing
-from serving.station.settings import Settings
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.tracking import signing
+from loopwright.serving.station.settings import Settings
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = (DOCS / "trust.md").read_text(encoding="utf-8")

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from signing_parts import NOW, payload_of, sign_payload
 
-import serving.controller
-from pipeline.export.controller_file import with_evidence
-from serving import ArtifactError, Controller, LoopwrightError, SignatureError
-from serving.__main__ import main
-from serving.digest import file_digest
-from serving.signing import verify
-from serving.signing.keys import PrivateKey
-from serving.signing.sign import sign
-from serving.signing.verify import Signed, signature_of
+import loopwright.serving.controller
+from loopwright.pipeline.export.controller_file import with_evidence
+from loopwright.serving import ArtifactError, Controller, LoopwrightError, SignatureError
+from loopwright.serving.__main__ import main
+from loopwright.serving.digest import file_digest
+from loopwright.serving.signing import verify
+from loopwright.serving.signing.keys import PrivateKey
+from loopwright.serving.signing.sign import sign
+from loopwright.serving.signing.verify import Signed, signature_of
 
 pytest_plugins = ["small_laws", "signed_files"]
 
@@ -59,7 +59,7 @@ def test_a_file_that_is_not_trusted_is_never_parsed(
         os.replace(sign(other, private("anna")), place)
     parsed: list[str] = []
     for name in ("unseal", "audit", "_manifest", "_session"):
-        monkeypatch.setattr(serving.controller, name, lambda *_, name=name: parsed.append(name))
+        monkeypatch.setattr(loopwright.serving.controller, name, lambda *_, name=name: parsed.append(name))
     with pytest.raises(SignatureError) as error:
         Controller(signed, trusted=[keys / "anna.pub"])
     assert "\n" not in str(error.value)

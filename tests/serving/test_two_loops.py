@@ -19,16 +19,16 @@ from asyncua import Client
 from plant_servers import CASE, SPACE, Plant, RunningLoop, loop_toml
 from processes import within
 
-from pipeline.__main__ import main
-from serving import Mode
-from serving.errors import LoopError
-from serving.opcua.lease import SCANS, NodeLease
-from serving.opcua.nameplates import Identity
-from serving.station import station
-from serving.station.control import Control, ask, door
-from serving.station.lease import Lease, address_of
-from serving.station.locks import Locks
-from serving.station.tending import Tending
+from loopwright.pipeline.__main__ import main
+from loopwright.serving import Mode
+from loopwright.serving.errors import LoopError
+from loopwright.serving.opcua.lease import SCANS, NodeLease
+from loopwright.serving.opcua.nameplates import Identity
+from loopwright.serving.station import station
+from loopwright.serving.station.control import Control, ask, door
+from loopwright.serving.station.lease import Lease, address_of
+from loopwright.serving.station.locks import Locks
+from loopwright.serving.station.tending import Tending
 
 SPEED = 2.0  # periods of .25 s: a loop counts as gone after five without a renewal
 LEASE = f'lease = "{SPACE}Control.Lease"'

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from serving import Controller, ControlLoop, EndpointError, Fallback, Mode, Sample, VirtualClock
+from loopwright.serving import Controller, ControlLoop, EndpointError, Fallback, Mode, Sample, VirtualClock
 
 pytest_plugins = ["small_laws"]
 STANDS = 63.0

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from serving import Controller
-from serving.fault import kind_of
-from serving.opcua.sampling import Sampling
-from serving.opcua.settings import Nodes, Server
+from loopwright.serving import Controller
+from loopwright.serving.fault import kind_of
+from loopwright.serving.opcua.sampling import Sampling
+from loopwright.serving.opcua.settings import Nodes, Server
 
 pytest_plugins = ["small_laws"]
 

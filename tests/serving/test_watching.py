@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from processes import within
 
-from serving import Command, Controller, Mode
-from serving.journal import Journal, JournalReader
-from serving.monitor import Monitor, Verdict
-from serving.station.recorder import Recorder
-from serving.station.station import Station
-from serving.station.watching import Watching
+from loopwright.serving import Command, Controller, Mode
+from loopwright.serving.journal import Journal, JournalReader
+from loopwright.serving.monitor import Monitor, Verdict
+from loopwright.serving.station.recorder import Recorder
+from loopwright.serving.station.station import Station
+from loopwright.serving.station.watching import Watching
 
 FILE = Path(__file__).parents[2] / "artifacts" / "ph_neutralization" / "pid.onnx"
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from made_up_plant import Lag
 
-from pipeline.cases import PLANTS
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.errors import PlantError
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import simulate_batch, simulate_closed, simulate_open
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import simulate_batch, simulate_closed, simulate_open
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from pipeline.plants.signals import Signals
-from pipeline.simulation.rests import balanced, courses, local_gains, settled
-from serving.manifest import Signal
+from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.simulation.rests import balanced, courses, local_gains, settled
+from loopwright.serving.manifest import Signal
 
 POLE = 0.8
 

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import yaml
 
-from pipeline.__main__ import main
-from pipeline.cases import CASES
-from pipeline.cases.ph_neutralization.case import PhNeutralizationCase
-from pipeline.plants.equations import EquationPlant
-from pipeline.stages import check
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.stages import check
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,8 +11,8 @@ import pytest
 import yaml
 from own_cases import section, two_lags
 
-from pipeline.__main__ import main
-from pipeline.stages.check import mistakes, notes
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.stages.check import mistakes, notes
 
 SET = {"kind": "identified"}
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.cases import CASES
-from pipeline.stages.code import APART, CARRIERS, LAST, PACKAGES, STAGES, code, graph, listing, modules
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.stages.code import APART, CARRIERS, LAST, PACKAGES, STAGES, code, graph, listing, modules
 
 ROOT = Path(__file__).parents[2]
 DVC = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
@@ -19,7 +19,7 @@ DVC = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
 def test_every_stage_of_a_case_depends_on_its_files(stage: str) -> None:
     entry = DVC[stage]["do"]
     assert any(d.startswith(f"work/code/{stage}-") for d in entry["deps"])
-    assert entry["cmd"].startswith(f"python -m pipeline.engine.start {stage} ")
+    assert entry["cmd"].startswith(f"python -m loopwright.pipeline.engine.start {stage} ")
     assert not any(d.startswith(("pipeline/", "serving/")) for d in entry["deps"])
 
 
@@ -35,16 +35,19 @@ def test_the_list_of_files_is_made_of_all_of_them_and_before_the_rest() -> None:
 @pytest.mark.parametrize("stage", STAGES)
 def test_nothing_is_missing_but_what_is_named_as_apart(stage: str, case: str) -> None:
     imports = graph()
-    everything = {f"pipeline.stages.{stage}", *imports.find_upstream_modules(f"pipeline.stages.{stage}")}
+    everything = {
+        f"loopwright.pipeline.stages.{stage}",
+        *imports.find_upstream_modules(f"loopwright.pipeline.stages.{stage}"),
+    }
     own = modules(stage, case)
-    named = (*CARRIERS, "pipeline.cases", *(what for _, what in APART.get(stage, ())))
+    named = (*CARRIERS, "loopwright.pipeline.cases", *(what for _, what in APART.get(stage, ())))
 
     def left_out(module: str) -> bool:
         return any(module == name or module.startswith(name + ".") for name in named if name not in PACKAGES)
 
     for module in {m for m in everything - own if not left_out(m)} - {"pipeline", "serving"}:
         importers = imports.find_modules_that_directly_import(module) & everything
-        assert not {i for i in importers & own if i != "pipeline.cases"}, module
+        assert not {i for i in importers & own if i != "loopwright.pipeline.cases"}, module
 
 
 @pytest.mark.parametrize(
@@ -82,7 +85,7 @@ def test_the_list_of_a_case_that_is_no_more_goes(tmp_path: Path, monkeypatch: py
     """Whoever runs the stage finds what DVC finds, which empties the folder before."""
     (tmp_path / "params.yaml").write_text("cases: {}\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pipeline.stages.code.listing", lambda *_: {})
+    monkeypatch.setattr("loopwright.pipeline.stages.code.listing", lambda *_: {})
     code()
     made = {file.name for file in Path("work/code").iterdir()}
     assert {"data.json", "overview.json", "publish.json", "fit-batch_reactor.json"} <= made

@@ -13,15 +13,15 @@ from own_cases import controllers_of_a_lag
 from rich.console import Console
 from undrawn import draw_nothing
 
-from pipeline.cases.own_plant import OwnCase
-from pipeline.errors import LawError, ModelError, ParamsError, PlantError, RecordError
-from pipeline.evaluation.validation import Validation
-from pipeline.laws.pid.pid import PID
-from pipeline.report.results import show_results, without_controller
-from pipeline.stages.design import design
-from pipeline.stages.report import report
-from pipeline.stages.validate import validate
-from pipeline.tracking.gate import Gate
+from loopwright.pipeline.cases.own_plant import OwnCase
+from loopwright.pipeline.errors import LawError, ModelError, ParamsError, PlantError, RecordError
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.laws.pid.pid import PID
+from loopwright.pipeline.report.results import show_results, without_controller
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.report import report
+from loopwright.pipeline.stages.validate import validate
+from loopwright.pipeline.tracking.gate import Gate
 
 GIVEN = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 3.0}
 
@@ -171,7 +171,7 @@ def test_without_any_law_the_report_shows_the_model_and_the_reasons(monkeypatch:
 
 
 def test_a_plant_without_loads_is_scored_by_its_other_tests(plant: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.cases.own_plant.held_load", lambda *_: None)
+    monkeypatch.setattr("loopwright.pipeline.cases.own_plant.held_load", lambda *_: None)
     found = designed_and_validated("pid")
     assert found.gate.laws["pid"].score is not None
     assert found.gate.weights == {"held_out": 0.5882, "held_out_noise": 0.2353, "spoilt": 0.1765}

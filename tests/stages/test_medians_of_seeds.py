@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.stages.fit import _median
+from loopwright.pipeline.stages.fit import _median
 
 
 def test_a_number_counts_in_the_seeds_that_have_it() -> None:

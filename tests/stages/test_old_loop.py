@@ -12,13 +12,13 @@ from own_cases import controllers_of_a_lag
 from rich.console import Console
 from undrawn import draw_nothing
 
-from pipeline.evaluation.validation import Validation
-from pipeline.records.set_points import SetPoints
-from pipeline.report.results import show_results
-from pipeline.stages.design import design
-from pipeline.stages.report import report
-from pipeline.stages.validate import validate
-from pipeline.tracking.gate import Gate
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.records.set_points import SetPoints
+from loopwright.pipeline.report.results import show_results
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.report import report
+from loopwright.pipeline.stages.validate import validate
+from loopwright.pipeline.tracking.gate import Gate
 
 GOOD = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 3.0}
 SLUGGISH, EAGER = GOOD | {"kc": 0.05}, GOOD | {"kc": 0.7}

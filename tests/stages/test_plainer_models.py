@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 
 import pytest
 
-from pipeline.models.identified.selection import Selection
-from pipeline.models.identified.structure_search import Searched, StructureSearch
-from pipeline.models.part import Groundwork, Learnt, Part, Source, done
-from pipeline.stages.fit import _proven_if_possible
+from loopwright.pipeline.models.identified.selection import Selection
+from loopwright.pipeline.models.identified.structure_search import Searched, StructureSearch
+from loopwright.pipeline.models.part import Groundwork, Learnt, Part, Source, done
+from loopwright.pipeline.stages.fit import _proven_if_possible
 
 
 @dataclass

@@ -12,16 +12,16 @@ from own_cases import controllers_of_a_lag
 from rich.console import Console
 from undrawn import draw_nothing
 
-from pipeline.cases import all_cases
-from pipeline.evaluation.law_evidence import LawMetrics
-from pipeline.evaluation.open_loop import errors_at_rest
-from pipeline.evaluation.validation import Validation
-from pipeline.metrics import mae
-from pipeline.report.results import show_results
-from pipeline.stages.code import listing
-from pipeline.stages.design import design
-from pipeline.stages.report import report
-from pipeline.stages.validate import validate
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.evaluation.law_evidence import LawMetrics
+from loopwright.pipeline.evaluation.open_loop import errors_at_rest
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.metrics import mae
+from loopwright.pipeline.report.results import show_results
+from loopwright.pipeline.stages.code import listing
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.report import report
+from loopwright.pipeline.stages.validate import validate
 
 PI = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 3.0}
 HARDLY = PI | {"kc": 0.002}

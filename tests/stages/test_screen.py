@@ -15,22 +15,22 @@ import yaml
 from dirty_plant import cells, clean, write
 from undrawn import draw_nothing
 
-from pipeline.__main__ import main
-from pipeline.cases.own_entries import entries_of
-from pipeline.config.exports import ExportParams, screened_record
-from pipeline.config.params import ModelParams, parse
-from pipeline.engine.command import run_stage
-from pipeline.evaluation.case import Case
-from pipeline.files import sha256
-from pipeline.laws.pid.pid import PID
-from pipeline.models.identified.structure_search import MINUTES, StructureSearch
-from pipeline.models.part import groundworks
-from pipeline.records.old_controller import OldController
-from pipeline.stages.check import mistakes
-from pipeline.stages.code import listing
-from pipeline.stages.fit import parts_of
-from pipeline.stages.screen import screen
-from pipeline.tracking.stage_results import StageResult, datasets
+from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases.own_entries import entries_of
+from loopwright.pipeline.config.exports import ExportParams, screened_record
+from loopwright.pipeline.config.params import ModelParams, parse
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.files import sha256
+from loopwright.pipeline.laws.pid.pid import PID
+from loopwright.pipeline.models.identified.structure_search import MINUTES, StructureSearch
+from loopwright.pipeline.models.part import groundworks
+from loopwright.pipeline.records.old_controller import OldController
+from loopwright.pipeline.stages.check import mistakes
+from loopwright.pipeline.stages.code import listing
+from loopwright.pipeline.stages.fit import parts_of
+from loopwright.pipeline.stages.screen import screen
+from loopwright.pipeline.tracking.stage_results import StageResult, datasets
 
 ROOT = Path(__file__).parents[2]
 ROLES = ["--pv", "TIC-101.PV[degC]", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]=300..700"]
@@ -332,7 +332,7 @@ def test_models_of_earlier_signals_do_not_stop_a_run() -> None:
 
 
 def case() -> Case:
-    from pipeline.cases import all_cases
+    from loopwright.pipeline.cases import all_cases
 
     return all_cases()["tank"]
 

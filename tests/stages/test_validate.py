@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.cases import CASES
-from pipeline.cases.thiosulfate_cstr.case import TJ, ThiosulfateCstrCase
-from pipeline.engine.command import run_stage
-from pipeline.errors import LawError
-from pipeline.evaluation.law_evidence import LawMetrics
-from pipeline.records.record import Record
-from pipeline.simulation.scenario import Scenario, held
-from pipeline.stages import validate as stage
-from serving import Controller
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.cases.thiosulfate_cstr.case import TJ, ThiosulfateCstrCase
+from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.evaluation.law_evidence import LawMetrics
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.scenario import Scenario, held
+from loopwright.pipeline.stages import validate as stage
+from loopwright.serving import Controller
 
 CASE, LAW = "thiosulfate_cstr", "pid"
 FILE = Path(__file__).parents[2] / "artifacts" / CASE / f"{LAW}.onnx"

@@ -15,15 +15,15 @@ from identified_models import first_order, scaled_model
 from own_cases import case_of, section
 from rich.console import Console
 
-from pipeline.cases import all_cases
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.law_evidence import LawEvidence, LawMetrics
-from pipeline.report.results import show_results
-from pipeline.stages.check import notes
-from pipeline.stages.design import design
-from pipeline.stages.report import report
-from pipeline.stages.validate import validate
-from serving import Controller
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import LawEvidence, LawMetrics
+from loopwright.pipeline.report.results import show_results
+from loopwright.pipeline.stages.check import notes
+from loopwright.pipeline.stages.design import design
+from loopwright.pipeline.stages.report import report
+from loopwright.pipeline.stages.validate import validate
+from loopwright.serving import Controller
 
 POLES = (0.6, 0.55, 0.65)
 

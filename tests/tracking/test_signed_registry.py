@@ -13,14 +13,14 @@ import pytest
 from made_up_case import CASE
 from mlflow.entities.model_registry import ModelVersion
 
-from pipeline.__main__ import main as loopwright
-from pipeline.errors import TrackingError
-from pipeline.tracking import signing
-from pipeline.tracking.publish import publish
-from pipeline.tracking.registry import versions
-from pipeline.tracking.store import store
-from serving import Controller, SignatureError
-from serving.signing.keys import PublicKey, make_pair
+from loopwright.pipeline.__main__ import main as loopwright
+from loopwright.pipeline.errors import TrackingError
+from loopwright.pipeline.tracking import signing
+from loopwright.pipeline.tracking.publish import publish
+from loopwright.pipeline.tracking.registry import versions
+from loopwright.pipeline.tracking.store import store
+from loopwright.serving import Controller, SignatureError
+from loopwright.serving.signing.keys import PublicKey, make_pair
 
 pytest_plugins = ["signed_files"]
 pytestmark = [

@@ -19,18 +19,18 @@ import pytest
 from made_up_case import CASE
 from mlflow.entities import Run
 
-import pipeline
-from pipeline.__main__ import main as loopwright
-from pipeline.commands.registry import CHAMPIONS
-from pipeline.engine.start import DOOR, receipt_path
-from pipeline.errors import TrackingError
-from pipeline.evaluation.validation import Validation
-from pipeline.files import sha256
-from pipeline.tracking.gate import Gate
-from pipeline.tracking.publish import publish
-from pipeline.tracking.registry import REQUIREMENTS, versions
-from pipeline.tracking.stage_results import StageResult, Times, dataset_hash, datasets, read_lock
-from pipeline.tracking.store import store
+from loopwright import pipeline
+from loopwright.pipeline.__main__ import main as loopwright
+from loopwright.pipeline.commands.registry import CHAMPIONS
+from loopwright.pipeline.engine.start import DOOR, receipt_path
+from loopwright.pipeline.errors import TrackingError
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.files import sha256
+from loopwright.pipeline.tracking.gate import Gate
+from loopwright.pipeline.tracking.publish import publish
+from loopwright.pipeline.tracking.registry import REQUIREMENTS, versions
+from loopwright.pipeline.tracking.stage_results import StageResult, Times, dataset_hash, datasets, read_lock
+from loopwright.pipeline.tracking.store import store
 
 pytestmark = [
     # SQLAlchemy's complaint about a loader that mlflow's own tables use
@@ -401,7 +401,7 @@ def test_a_stage_under_dvc_leaves_a_receipt_that_fits_its_files(tmp_path):
         "from pathlib import Path\nimport sys\nPath(sys.argv[1]).write_text('made')\nsys.exit(sys.argv[1] == 'bad')\n"
     )
     (package / "stages" / "probe.py").write_text(probe)
-    command = f'"{sys.executable}" -m pipeline.engine.start probe'
+    command = f'"{sys.executable}" -m loopwright.pipeline.engine.start probe'
     stages = {out: {"cmd": f"{command} {out}", "outs": [out]} for out in ("good", "bad")}
     (tmp_path / "dvc.yaml").write_text(json.dumps({"stages": stages}))
     environment = {k: v for k, v in os.environ.items() if k not in {DOOR, "PYTHONPATH"}}

@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from identified_models import made_signals
 
-from pipeline.errors import LawError
-from pipeline.laws.pid.pid import PID
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.tuning.development import DevelopmentLoops
-from pipeline.tuning.loop_search import searched, simc
-from pipeline.tuning.pairing import pairings, relative_gains
-from pipeline.tuning.responses import FirstOrder, StepResponses
-from pipeline.tuning.rules import PidSettings
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.pid.pid import PID
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.tuning.development import DevelopmentLoops
+from loopwright.pipeline.tuning.loop_search import searched, simc
+from loopwright.pipeline.tuning.pairing import pairings, relative_gains
+from loopwright.pipeline.tuning.responses import FirstOrder, StepResponses
+from loopwright.pipeline.tuning.rules import PidSettings
 
 
 class Sampled(Simulator):

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.tuning.pid_forms import PidForms, whole_span
-from pipeline.tuning.rules import PidSettings
-from serving.manifest import Signal
+from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span
+from loopwright.pipeline.tuning.rules import PidSettings
+from loopwright.serving.manifest import Signal
 
 S = 1j * np.geomspace(1e-4, 10, 30)  # [1/s]
 

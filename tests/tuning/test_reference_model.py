@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import signal
 from scipy.integrate import quad, solve_ivp
 
-from pipeline.tuning.reference_model import CLASSIC, ORDERS, ReferenceModel, itae, searched
+from loopwright.pipeline.tuning.reference_model import CLASSIC, ORDERS, ReferenceModel, itae, searched
 
 
 @pytest.mark.parametrize("order", ORDERS)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
-from pipeline.errors import LawError, PlantError
-from pipeline.laws.pid.pid import PID
-from pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
-from pipeline.tuning.rules import PidSettings, sampled_loop
-from pipeline.tuning.stability import (
+from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
+from loopwright.pipeline.errors import LawError, PlantError
+from loopwright.pipeline.laws.pid.pid import PID
+from loopwright.pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
+from loopwright.pipeline.tuning.rules import PidSettings, sampled_loop
+from loopwright.pipeline.tuning.stability import (
     LARGEST_MARGIN,
     FrozenLoops,
     feedback,

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import LawError, PlantError
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.linearization import Linearization
-from pipeline.tuning.development import DevelopmentLoops
-from pipeline.tuning.reduction import LagWithDeadTime, minimal
-from pipeline.tuning.rules import (
+from loopwright.pipeline.errors import LawError, PlantError
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.tuning.development import DevelopmentLoops
+from loopwright.pipeline.tuning.reduction import LagWithDeadTime, minimal
+from loopwright.pipeline.tuning.rules import (
     AllPole,
     PidSettings,
     imc_pid,

@@ -1,7 +1,8 @@
 """List what a wheel holds, and refuse what does not belong there: ``python content.py WHEEL``.
 
-A wheel has two packages. ``serving`` is the runtime, ``pipeline`` makes controllers. Each holds its modules and the few
-files that they open; no test, no record, and no bounds of a case, which are read in the repository alone.
+A wheel has two packages. ``loopwright.serving`` is the runtime, ``loopwright.pipeline`` makes controllers. Each holds
+its modules and the few files that they open; no test, no record, and no bounds of a case, which are read in the
+repository alone.
 """
 
 from __future__ import annotations
@@ -12,21 +13,21 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("pipeline", "serving")
+TOP, PACKAGES = "loopwright", ("pipeline", "serving")
 # The folders of files that the modules open, and the kinds of these files.
 OPENED = {
-    "serving/page/static": {".js", ".css", ".html", ".svg"},
-    "pipeline/report/templates": {".j2"},
-    "pipeline/hosts/c": {".c"},
-    "pipeline/hosts/c/onnxruntime": {".h"},
-    "pipeline/hosts/javascript": {".mjs"},
-    "pipeline/hosts/fmu/sources": {".c"},
-    "pipeline/playground/static": {".js", ".css", ".html"},
-    "pipeline/playground/npm": {".json"},
+    "loopwright/serving/page/static": {".js", ".css", ".html", ".svg"},
+    "loopwright/pipeline/report/templates": {".j2"},
+    "loopwright/pipeline/hosts/c": {".c"},
+    "loopwright/pipeline/hosts/c/onnxruntime": {".h"},
+    "loopwright/pipeline/hosts/javascript": {".mjs"},
+    "loopwright/pipeline/hosts/fmu/sources": {".c"},
+    "loopwright/pipeline/playground/static": {".js", ".css", ".html"},
+    "loopwright/pipeline/playground/npm": {".json"},
 }
 FEW = {
-    *("serving/py.typed", "pipeline/py.typed", "serving/page/static/uPlot-LICENSE"),
-    *("pipeline/playground/npm/onnxruntime-LICENSE", "pipeline/hosts/c/onnxruntime/LICENSE"),
+    *("loopwright/serving/py.typed", "loopwright/pipeline/py.typed", "loopwright/serving/page/static/uPlot-LICENSE"),
+    *("loopwright/pipeline/playground/npm/onnxruntime-LICENSE", "loopwright/pipeline/hosts/c/onnxruntime/LICENSE"),
 }
 DIST_INFO = {
     *("METADATA", "WHEEL", "RECORD", "entry_points.txt", "top_level.txt"),
@@ -44,13 +45,13 @@ def faults(names: set[str], modules: set[str]) -> list[str]:
 def named_cases(wheel: zipfile.ZipFile) -> list[str]:
     """The files of the runtime that name a case."""
     cases = [p.parent.name.encode() for p in (ROOT / "pipeline/cases").glob("*/case.py")]
-    ours = [name for name in wheel.namelist() if name.startswith("serving/")]
+    ours = [name for name in wheel.namelist() if name.startswith(f"{TOP}/serving/")]
     return [f"{name}: names a case" for name in ours if any(case in wheel.read(name) for case in cases)]
 
 
 def sources() -> set[str]:
     """The modules of the sources, as a wheel names them."""
-    return {p.relative_to(ROOT).as_posix() for package in PACKAGES for p in (ROOT / package).rglob("*.py")}
+    return {f"{TOP}/{p.relative_to(ROOT).as_posix()}" for package in PACKAGES for p in (ROOT / package).rglob("*.py")}
 
 
 def _belongs(name: str, modules: set[str]) -> bool:
@@ -67,8 +68,9 @@ def listing(wheel: zipfile.ZipFile) -> str:
     packed: Counter[str] = Counter()
     for row in wheel.infolist():
         path = PurePosixPath(row.filename)
-        kinds[path.parts[0], path.suffix or path.name] += 1
-        packed[path.parts[0]] += row.compress_size
+        top = "/".join(path.parts[:2]) if path.parts[0] == TOP else path.parts[0]
+        kinds[top, path.suffix or path.name] += 1
+        packed[top] += row.compress_size
     heads = [f"{packed[top]:9,} bytes packed  {top}: {_kinds(kinds, top)}" for top in sorted(packed)]
     return "\n".join([*heads, "", *(f"{size:9,}  {name}" for name, size in sorted(sizes.items()))])
 

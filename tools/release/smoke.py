@@ -24,7 +24,7 @@ def main(controller: str) -> None:
     """Import, load, step and inspect; each other command names its extra."""
     found = [name for name in ABSENT if find_spec(name)]
     assert not found, f"not only the runtime is here: {found}"
-    import serving
+    from loopwright import serving
 
     place = Path(serving.__file__).parent
     assert place.is_relative_to(sys.prefix), f"serving comes from {place}, not from this environment"
@@ -35,13 +35,13 @@ def main(controller: str) -> None:
         sp=middle["sp"], pv=middle["pv"], dv=middle["dv"], mv_applied=middle["mv"], state=loaded.cold_state()
     )
     assert all(s.low <= value <= s.high for s, value in zip(loaded.manifest.mv, mv, strict=True))
-    heavy = {"pipeline", "onnx", "torch"} & set(sys.modules)
+    heavy = {"loopwright.pipeline", "onnx", "torch"} & set(sys.modules)
     assert not heavy, f"a step imported {heavy}"
 
     assert said("--version") == (0, f"loopwright {serving.__version__}\n")
     for told in (said("inspect", controller), said("bench", controller, "--steps", "50", "--loop-steps", "5")):
         assert told[0] == 0, told[1]
-    from pipeline.commands import COMMANDS
+    from loopwright.pipeline.commands import COMMANDS
 
     extras = {command: extra for command in COMMANDS if (extra := lacks(command))}
     assert extras.items() >= EXTRAS.items(), f"not what each command lacks: {extras}"

@@ -21,7 +21,18 @@ def main(venv: str, controller: str, case: str) -> None:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     with tempfile.TemporaryDirectory() as folder:
-        serve = [sys.executable, "-m", "pipeline", "plant", "serve", case, "--listen", address, "--speed", "20"]
+        serve = [
+            sys.executable,
+            "-m",
+            "loopwright.pipeline",
+            "plant",
+            "serve",
+            case,
+            "--listen",
+            address,
+            "--speed",
+            "20",
+        ]
         server = subprocess.Popen(
             [*serve, "--folder", f"{folder}/server"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
         )

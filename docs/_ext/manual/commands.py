@@ -7,8 +7,8 @@ import importlib
 import os
 from collections.abc import Iterator, Sequence
 
+from loopwright.pipeline.commands import COMMANDS, Parser
 from manual.markdown import code, table
-from pipeline.commands import COMMANDS, Parser
 
 Actions = argparse._SubParsersAction
 
@@ -19,7 +19,7 @@ def parser_of(name: str) -> argparse.ArgumentParser:
     before = os.environ.get("LOGNAME")
     os.environ["LOGNAME"] = "you"  # a default that is the user's name
     try:
-        importlib.import_module(f"pipeline.commands.{name}").options(parser)
+        importlib.import_module(f"loopwright.pipeline.commands.{name}").options(parser)
     finally:
         if before is None:
             del os.environ["LOGNAME"]

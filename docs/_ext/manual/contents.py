@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from loopwright.pipeline.cases import CASES, beside
+from loopwright.pipeline.config.exports import ExportParams
+from loopwright.pipeline.config.params import CaseParams, ControllerParams, ModelParams, RecordParams
+from loopwright.pipeline.config.plants import PlantParams
+from loopwright.pipeline.evaluation.metric import METRICS
+from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.excitation import EXCITATIONS
+from loopwright.pipeline.models import MODELS
+from loopwright.pipeline.models.training.fit import TRAINERS
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.station.settings import Settings
 from manual.commands import commands
 from manual.errors import errors
 from manual.floors import contracts, floors
 from manual.laws import choice, facts, info_names, results
 from manual.markdown import code, prose, table
 from manual.parameters import parameters, whole
-from pipeline.cases import CASES, beside
-from pipeline.config.exports import ExportParams
-from pipeline.config.params import CaseParams, ControllerParams, ModelParams, RecordParams
-from pipeline.config.plants import PlantParams
-from pipeline.evaluation.metric import METRICS
-from pipeline.evaluation.validation import Validation
-from pipeline.excitation import EXCITATIONS
-from pipeline.models import MODELS
-from pipeline.models.training.fit import TRAINERS
-from serving.manifest import Manifest
-from serving.station.settings import Settings
 
 SECTIONS = {
     "cases": CaseParams,

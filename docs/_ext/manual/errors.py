@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from loopwright.pipeline.evaluation.evidence import NotMeasuredError
+from loopwright.pipeline.historian.tags import TableError
+from loopwright.serving.errors import LoopwrightError
 from manual.markdown import code, prose, table
-from pipeline.evaluation.evidence import NotMeasuredError
-from pipeline.historian.tags import TableError
-from serving.errors import LoopwrightError
 
 ELSEWHERE = (NotMeasuredError, TableError)
 """Errors that stand beside the one module that raises them; their import makes them known."""
@@ -21,7 +21,7 @@ def known() -> list[type[LoopwrightError]]:
 def _below(cls: type[LoopwrightError]) -> Iterator[type[LoopwrightError]]:
     yield cls
     for sub in cls.__subclasses__():
-        if sub.__module__.startswith(("serving", "pipeline")):
+        if sub.__module__.startswith(("loopwright.serving", "loopwright.pipeline")):
             yield from _below(sub)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import grimp
 
+from loopwright.pipeline.stages.code import PIPELINE, SERVING
 from manual.markdown import code, first_sentence, prose, table
 
 ROOT = Path(__file__).parents[3]
@@ -30,13 +31,13 @@ def layers() -> list[list[str]]:
 @cache
 def imports() -> dict[str, set[str]]:
     """Folder of ``pipeline`` -> the folders, and ``serving``, that its modules import."""
-    graph = grimp.build_graph("pipeline", "serving", cache_dir=None)
+    graph = grimp.build_graph(PIPELINE, SERVING, cache_dir=None)
     found: dict[str, set[str]] = {}
     for module in graph.modules:
-        if module.startswith("pipeline."):
-            own = module.split(".")[1]
+        if module.startswith(f"{PIPELINE}."):
+            own = module.split(".")[2]
             for other in graph.find_modules_directly_imported_by(module):
-                parts = other.split(".")
+                parts = other.split(".")[1:]
                 target = "serving" if parts[0] == "serving" else parts[1] if len(parts) > 1 else ""
                 if target and target != own:
                     found.setdefault(own, set()).add(target)
@@ -50,7 +51,7 @@ def modules_of(name: str) -> int:
 
 
 def _words(name: str) -> str:
-    module = "pipeline.__main__" if name == "__main__" else f"pipeline.{name}"
+    module = f"{PIPELINE}.{name}"
     return first_sentence(importlib.import_module(module).__doc__)
 
 

@@ -9,11 +9,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.evaluation.validation import FILE, Validation
+from loopwright.pipeline.laws import LAWS, ControlLaw
 from manual.markdown import code, prose, table
 from manual.parameters import whole
-from pipeline.cases import CASES
-from pipeline.evaluation.validation import FILE, Validation
-from pipeline.laws import LAWS, ControlLaw
 
 ROOT = Path(__file__).parents[3]
 INFO = Path(__file__).with_name("info.toml")

@@ -14,8 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from loopwright.pipeline.commands.parameters import default_of, texts
 from manual.markdown import code, prose, table
-from pipeline.commands.parameters import default_of, texts
 
 WORDS = Path(__file__).with_name("words.toml")
 """Words for what no docstring describes: class -> field -> words."""

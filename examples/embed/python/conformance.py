@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
-from serving import Controller, ControlLoop, Mode, OutputError, Sample, SampleError
+from loopwright.serving import Controller, ControlLoop, Mode, OutputError, Sample, SampleError
 
 OUTPUTS = ("mv", "state_next", "info")
 kit = Path(sys.argv[1] if sys.argv[1:] else sys.exit("usage: python conformance.py KIT [ANSWERS.json]"))

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-from serving import Controller, ControlLoop, Mode, MonotonicClock, Sample
+from loopwright.serving import Controller, ControlLoop, Mode, MonotonicClock, Sample
 
 
 class Plant:

@@ -2,7 +2,7 @@
 
 import sys
 
-from serving import Controller
+from loopwright.serving import Controller
 
 controller = Controller(sys.argv[1] if sys.argv[1:] else sys.exit("usage: python python_runtime.py FILE.onnx"))
 m, state = controller.manifest, controller.cold_state()  # zeros: no past

@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.cases.batch_reactor.plant import BatchReactor
-from pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, PaperTable, Requirement
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.cases.batch_reactor.plant import BatchReactor
+from loopwright.pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, PaperTable, Requirement
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.scenario import Scenario
 
 END_S, LATE_S = 1000.0, 200.0  # full heating from 25 deg C meets the profile after 171 s
 PROFILE = (54.0, 71.0, 2.5e-3)  # [deg C], [deg C], [1/s]

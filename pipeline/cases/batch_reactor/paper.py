@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cases.batch_reactor.case import CALMED, PLAIN
-from pipeline.evaluation.case import Curve, PaperFigure
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from pipeline.pictures.numbers import number
-from pipeline.pictures.words import law_name
+from loopwright.pipeline.cases.batch_reactor.case import CALMED, PLAIN
+from loopwright.pipeline.evaluation.case import Curve, PaperFigure
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
+from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 
 TEST, NOISY = "trajectory", "trajectory_noise"
 

@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 KELVIN = 273.15
 GRID = 400  # points of the steady curve

@@ -8,14 +8,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
-from pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
-from pipeline.evaluation.closed_loop import overshoots
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.metric import Metric
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
+from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
+from loopwright.pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
+from loopwright.pipeline.evaluation.closed_loop import overshoots
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.metric import Metric
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
 
 HOLD = 500  # samples: 10 min
 LEVELS = [0.02, 0.02, 0.04, 0.06, 0.08, 0.10, 0.12, 0.13]  # [mol/l]

@@ -8,14 +8,14 @@ from __future__ import annotations
 import numpy as np
 from scipy import optimize
 
-from pipeline.cases.henson_seborg_cstr.case import ALONE, AUTO, FAST, GAINS, PID_1, TUNED
-from pipeline.evaluation.case import Curve
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from pipeline.pictures.numbers import number
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.linearization import Linearization
+from loopwright.pipeline.cases.henson_seborg_cstr.case import ALONE, AUTO, FAST, GAINS, PID_1, TUNED
+from loopwright.pipeline.evaluation.case import Curve
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
+from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.linearization import Linearization
 
 SET = "local_models"
 SMALL = 0.10  # of a step: an overshoot that deserves the name

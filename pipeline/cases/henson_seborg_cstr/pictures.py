@@ -10,11 +10,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.cases.henson_seborg_cstr.case import ALONE, AUTO, GAINS, OUTPUTS, PID_1, TUNED, VELOCITY
-from pipeline.evaluation.case import Curve
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.law_evidence import Loop
-from pipeline.pictures.drawing import (
+from loopwright.pipeline.cases.henson_seborg_cstr.case import ALONE, AUTO, GAINS, OUTPUTS, PID_1, TUNED, VELOCITY
+from loopwright.pipeline.evaluation.case import Curve
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import Loop
+from loopwright.pipeline.pictures.drawing import (
     PALETTE,
     SET_POINT,
     SIZE,

@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
-from pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
-from pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement, Setting
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.metric import Metric
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.scenario import Scenario, random_levels, stepwise
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
+from loopwright.pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement, Setting
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.metric import Metric
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.scenario import Scenario, random_levels, stepwise
 
 RECIPE = ((0, 62.0), (800, 26.0), (1600, 35.0))  # first sample, core temperature [deg C]
 SAMPLES = 2000

@@ -7,11 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.excitation.base import Excitation, within
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
-from pipeline.simulation.simulate import noise_draws
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.excitation.base import Excitation, within
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.simulation.simulate import noise_draws
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 import casadi as ca
 import numpy as np
 
-from pipeline.cases.jacketed_batch_reactor.plant import COLD, GRID, HOT, JacketedBatchReactor
-from pipeline.errors import PlantError
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.cases.jacketed_batch_reactor.plant import COLD, GRID, HOT, JacketedBatchReactor
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 CENTRES = (12, 20, 40, 60, 70)  # jacket temperatures of the rules [degC]
 ROWS = {"a1": "-", "a2": "-", "b": "degC", "r": "degC"}  # and their units

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
-from pipeline.models.base import Model
-from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from pipeline.models.fuzzy.hybrid_fuzzy_part import figures
-from pipeline.models.part import Learnt, Part, Source
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import figures
+from loopwright.pipeline.models.part import Learnt, Part, Source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.cases.jacketed_batch_reactor.case import (
+from loopwright.pipeline.cases.jacketed_batch_reactor.case import (
     AHEAD,
     FEEDFORWARD,
     LAWS,
@@ -20,20 +20,20 @@ from pipeline.cases.jacketed_batch_reactor.case import (
     RECIPE,
     ROUNDING,
 )
-from pipeline.cases.jacketed_batch_reactor.fuzzy_models import (
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_models import (
     COLDEST,
     drift_when_shut,
     gaps,
     one_step_errors,
     weak_cold_valve,
 )
-from pipeline.cases.jacketed_batch_reactor.fuzzy_plant import MODES, FuzzyBatchReactor
-from pipeline.evaluation.case import Curve
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from pipeline.pictures.numbers import number
-from pipeline.pictures.words import law_name
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import MODES, FuzzyBatchReactor
+from loopwright.pipeline.evaluation.case import Curve
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
+from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 
 IDEAL = 1e-12  # [deg C] of rounding
 OFFSET = 0.05  # [deg C]

@@ -6,11 +6,11 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 from matplotlib.patheffects import withStroke
 
-from pipeline.cases.jacketed_batch_reactor.case import AHEAD, FEEDFORWARD, LAWS, OBSERVER, PENALTIES, PRINTED
-from pipeline.cases.jacketed_batch_reactor.fuzzy_models import MODES, coefficients_picture, reach_picture
-from pipeline.evaluation.case import Curve
-from pipeline.evaluation.evidence import Evidence
-from pipeline.pictures.drawing import (
+from loopwright.pipeline.cases.jacketed_batch_reactor.case import AHEAD, FEEDFORWARD, LAWS, OBSERVER, PENALTIES, PRINTED
+from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_models import MODES, coefficients_picture, reach_picture
+from loopwright.pipeline.evaluation.case import Curve
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.pictures.drawing import (
     PALETTE,
     SET_POINT,
     SIZE,
@@ -21,8 +21,8 @@ from pipeline.pictures.drawing import (
     scale,
     time_axis,
 )
-from pipeline.pictures.numbers import number
-from pipeline.pictures.words import law_name
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 
 SMALLEST = 1e-4  # [deg C] that a bar of offsets shows
 ROOM = 1.6  # factor above the highest point of a logarithmic axis, for its number

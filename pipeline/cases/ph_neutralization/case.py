@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.cases.ph_neutralization.plant import PhNeutralization
-from pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
+from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization
+from loopwright.pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
 
 HOLD_S = 1500.0
 SET_POINTS = [7.0, 9.0, 9.0, 8.0, 8.0, 8.0]

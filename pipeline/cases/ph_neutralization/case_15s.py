@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pipeline.cases.ph_neutralization.case import ASKED_OF_THE_BEST, PhNeutralizationCase
-from pipeline.cases.ph_neutralization.plant import PhNeutralization15s
-from pipeline.evaluation.case import Figure, PaperTable, Requirement
-from pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.cases.ph_neutralization.case import ASKED_OF_THE_BEST, PhNeutralizationCase
+from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization15s
+from loopwright.pipeline.evaluation.case import Figure, PaperTable, Requirement
+from loopwright.pipeline.plants.equations import EquationPlant
 
 
 @dataclass(frozen=True)

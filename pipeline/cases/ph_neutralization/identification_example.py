@@ -10,15 +10,15 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.models.base import Model
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.lagged.one_step import FORGETTING, OneStep, compare_one_step
-from pipeline.models.part import Learnt, Part, Source
-from pipeline.models.training.network_parts import trainer_of
-from pipeline.models.training.objectives import Samples
-from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.one_step import FORGETTING, OneStep, compare_one_step
+from loopwright.pipeline.models.part import Learnt, Part, Source
+from loopwright.pipeline.models.training.network_parts import trainer_of
+from loopwright.pipeline.models.training.objectives import Samples
+from loopwright.pipeline.models.training.regressors import nnarx_pairs
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 Array = NDArray[np.float64]
 

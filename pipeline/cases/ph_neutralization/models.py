@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.cases.ph_neutralization.identification_example import IdentificationExamplePart
-from pipeline.models.part import Part
+from loopwright.pipeline.cases.ph_neutralization.identification_example import IdentificationExamplePart
+from loopwright.pipeline.models.part import Part
 
 MODELS: dict[str, type[Part]] = {"identification_example": IdentificationExamplePart}  # whose model is an NNARX

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cases.ph_neutralization.case import ADAPTIVE, FIXED, LINEARIZED, RECURSIVE, SELF_TUNING
-from pipeline.evaluation.case import Curve, PaperFigure
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.timing import faster_than_nmpc, step_within
-from pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from pipeline.pictures.loop_pictures import LONGEST
-from pipeline.pictures.numbers import number, ratio
-from pipeline.pictures.words import curve_label
+from loopwright.pipeline.cases.ph_neutralization.case import ADAPTIVE, FIXED, LINEARIZED, RECURSIVE, SELF_TUNING
+from loopwright.pipeline.evaluation.case import Curve, PaperFigure
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
+from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.pictures.loop_pictures import LONGEST
+from loopwright.pipeline.pictures.numbers import number, ratio
+from loopwright.pipeline.pictures.words import curve_label
 
 SET, DISTURBED = "set_point", "disturbance"
 PENALTY_1, PENALTY_LOW = (Curve("linearized_pid", {"penalty": value}) for value in (1.0, 0.4))

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 
 import casadi as ca
 
-from pipeline.plants.equations import EquationPlant
-from serving.manifest import Signal
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.serving.manifest import Signal
 
 PH_RANGE = (0.0, 14.0)
 HALVINGS, NEWTON_STEPS = 10, 4

@@ -8,14 +8,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pipeline.cases.reversible_cstr.plant import ReversibleCstr
-from pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement
-from pipeline.evaluation.closed_loop import itae
-from pipeline.evaluation.effort import Effort
-from pipeline.evaluation.metric import Metric
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
-from pipeline.tuning.reference_model import ReferenceModel
+from loopwright.pipeline.cases.reversible_cstr.plant import ReversibleCstr
+from loopwright.pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement
+from loopwright.pipeline.evaluation.closed_loop import itae
+from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.metric import Metric
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
+from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
 LEVELS = [0.46, 0.40, 0.52, 0.36, 0.48, 0.54, 0.42, 0.38, 0.50, 0.44, 0.35, 0.55]  # [mol/l]
 HOLD = 200

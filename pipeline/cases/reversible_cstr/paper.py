@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.cases.reversible_cstr.case import NETWORK, ON_TEST, PI, PLAIN, PRINTED, PRINTED_SIGN, TUNED
-from pipeline.cases.reversible_cstr.plant import R, ReversibleCstr
-from pipeline.cases.reversible_cstr.reference_models import beats_the_classic_tables
-from pipeline.evaluation.case import Curve
-from pipeline.evaluation.closed_loop import overshoots
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.law_evidence import Array
-from pipeline.evaluation.timing import step_within
-from pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from pipeline.pictures.free_runs import free_run_fit_at_least, one_step_says_little
-from pipeline.pictures.numbers import number
+from loopwright.pipeline.cases.reversible_cstr.case import NETWORK, ON_TEST, PI, PLAIN, PRINTED, PRINTED_SIGN, TUNED
+from loopwright.pipeline.cases.reversible_cstr.plant import R, ReversibleCstr
+from loopwright.pipeline.cases.reversible_cstr.reference_models import beats_the_classic_tables
+from loopwright.pipeline.evaluation.case import Curve
+from loopwright.pipeline.evaluation.closed_loop import overshoots
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import Array
+from loopwright.pipeline.evaluation.timing import step_within
+from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.pictures.free_runs import free_run_fit_at_least, one_step_says_little
+from loopwright.pipeline.pictures.numbers import number
 
 SET = "plant_network"
 ALMOST = 0.95  # of the feed: what "almost complete" asks for

@@ -8,11 +8,11 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
-from pipeline.cases.reversible_cstr.case import HOLD, NETWORK, PI, PLAIN, PRINTED
-from pipeline.cases.reversible_cstr.reference_models import reference_models_picture
-from pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from pipeline.evaluation.law_evidence import Array, Loop
-from pipeline.pictures.drawing import (
+from loopwright.pipeline.cases.reversible_cstr.case import HOLD, NETWORK, PI, PLAIN, PRINTED
+from loopwright.pipeline.cases.reversible_cstr.reference_models import reference_models_picture
+from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import Array, Loop
+from loopwright.pipeline.pictures.drawing import (
     REFERENCE,
     SET_POINT,
     SHADES,
@@ -28,9 +28,9 @@ from pipeline.pictures.drawing import (
     symbol,
     time_axis,
 )
-from pipeline.pictures.free_runs import free_run_picture
-from pipeline.pictures.numbers import number
-from pipeline.pictures.words import law_name
+from loopwright.pipeline.pictures.free_runs import free_run_picture
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 
 LAWS = {
     "incremental network": NETWORK,

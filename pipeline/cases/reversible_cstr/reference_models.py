@@ -6,10 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from pipeline.evaluation.evidence import Evidence
-from pipeline.evaluation.verdicts import Outcome
-from pipeline.pictures.drawing import SHADES, SIZE
-from pipeline.tuning.reference_model import CLASSIC, ORDERS, ReferenceModel
+from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.verdicts import Outcome
+from loopwright.pipeline.pictures.drawing import SHADES, SIZE
+from loopwright.pipeline.tuning.reference_model import CLASSIC, ORDERS, ReferenceModel
 
 SPAN, STEP = 13.0, 0.02  # of the time wn t that is drawn
 HEAD = ("order", "found: coefficients of $s^{n-1}..s^1$", "ITAE", "classic table", "ITAE")

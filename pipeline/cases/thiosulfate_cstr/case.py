@@ -9,11 +9,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from pipeline.evaluation.case import Array, Case, Curve, Figure, PaperFigure, PaperTable, Requirement, Setting
-from pipeline.pictures.words import law_label, setting_text
-from pipeline.plants.equations import EquationPlant
-from pipeline.simulation.scenario import Scenario, held, random_levels
+from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
+from loopwright.pipeline.evaluation.case import (
+    Array,
+    Case,
+    Curve,
+    Figure,
+    PaperFigure,
+    PaperTable,
+    Requirement,
+    Setting,
+)
+from loopwright.pipeline.pictures.words import law_label, setting_text
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.simulation.scenario import Scenario, held, random_levels
 
 TJ = 250.0  # [K] of the three steady states
 HOLD = 80

@@ -8,12 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.evaluation.case import Case
-from pipeline.evaluation.stress.faults import Fault, draw_fault
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.simulation.scenario import Scenario
-from pipeline.simulation.simulate import DV_DRAW, disturbance_noise, noise_draws
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.stress.faults import Fault, draw_fault
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.pipeline.simulation.simulate import DV_DRAW, disturbance_noise, noise_draws
 
 NOISE = (0.5, 2.0)  # times the case's measurement noise
 LATE = 0.5  # share of the loops with one more sample of dead time

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 STUCK, ZERO, SPAN, SLOW = "stuck", "zero error", "span error", "slow"
 KINDS = (STUCK, ZERO, SPAN, SLOW)

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.closed_loop import left_limits, locked_up, swings
-from pipeline.evaluation.stress.draws import Draw, Drawing
-from pipeline.evaluation.stress.faults import Actuators
-from pipeline.plants.side_by_side import advance_rows
-from pipeline.plants.simulator import Array
-from pipeline.simulation.simulate import Trajectory
-from serving.controller import Controller
-from serving.manifest import Manifest
-from serving.rows import ControllerRows
+from loopwright.pipeline.evaluation.closed_loop import left_limits, locked_up, swings
+from loopwright.pipeline.evaluation.stress.draws import Draw, Drawing
+from loopwright.pipeline.evaluation.stress.faults import Actuators
+from loopwright.pipeline.plants.side_by_side import advance_rows
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.simulate import Trajectory
+from loopwright.serving.controller import Controller
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.rows import ControllerRows
 
 
 @dataclass(frozen=True)

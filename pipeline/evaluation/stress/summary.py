@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.evaluation.case import Case, Requirement
-from pipeline.evaluation.stress.draws import Draw
-from pipeline.evaluation.stress.loops import Outcome, figures_of
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.evaluation.case import Case, Requirement
+from loopwright.pipeline.evaluation.stress.draws import Draw
+from loopwright.pipeline.evaluation.stress.loops import Outcome, figures_of
+from loopwright.pipeline.plants.simulator import Array
 
 QUANTILES = (0.05, 0.5, 0.9, 0.99, 1.0)
 WORST = 10

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import onnx
 
-from pipeline.export.fusion.choice import choose
-from pipeline.export.fusion.emission import Outputs, emitted
-from pipeline.export.fusion.forms import forms_of
-from pipeline.export.fusion.items import Items
-from pipeline.export.fusion.joining import joined
-from pipeline.export.fusion.plan import Item
-from pipeline.export.fusion.postponing import postpone
-from pipeline.export.fusion.reading import Reading
+from loopwright.pipeline.export.fusion.choice import choose
+from loopwright.pipeline.export.fusion.emission import Outputs, emitted
+from loopwright.pipeline.export.fusion.forms import forms_of
+from loopwright.pipeline.export.fusion.items import Items
+from loopwright.pipeline.export.fusion.joining import joined
+from loopwright.pipeline.export.fusion.plan import Item
+from loopwright.pipeline.export.fusion.postponing import postpone
+from loopwright.pipeline.export.fusion.reading import Reading
 
 LEAST_SHARE = 0.002
 """A graph must save this share of its price; else it stays as it is."""

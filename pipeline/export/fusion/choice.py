@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipeline.export.fusion.plan import Account, Choice, Item
+from loopwright.pipeline.export.fusion.plan import Account, Choice, Item
 
 PREFERENCES = (
     ("recipe", "selection", "elementwise", "segments", "increment", "row", "group"),

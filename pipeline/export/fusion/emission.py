@@ -10,10 +10,10 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from pipeline.export.fusion.affine import Array, Attributes, Shape, numbers
-from pipeline.export.fusion.items import Items
-from pipeline.export.fusion.plan import Choice, Given, Input, Item, Member, Output, Several, Step
-from pipeline.export.fusion.pools import Group, Selection
+from loopwright.pipeline.export.fusion.affine import Array, Attributes, Shape, numbers
+from loopwright.pipeline.export.fusion.items import Items
+from loopwright.pipeline.export.fusion.plan import Choice, Given, Input, Item, Member, Output, Several, Step
+from loopwright.pipeline.export.fusion.pools import Group, Selection
 
 Outputs: TypeAlias = Sequence[tuple[str, Input]]
 """The graph's outputs by their names."""

@@ -9,9 +9,9 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from pipeline.export.fusion.affine import DENSE, Shape
-from serving.graph_audit import graph_values
-from serving.onnx_bytes import read_model
+from loopwright.pipeline.export.fusion.affine import DENSE, Shape
+from loopwright.serving.graph_audit import graph_values
+from loopwright.serving.onnx_bytes import read_model
 
 JOINED = "Tanh"
 MARK = "joined"  # in the names of what is added

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import onnx
 
-from pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, applied, numbers
-from pipeline.export.fusion.values import Block, Operand, Origin, Value, whole
+from loopwright.pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, applied, numbers
+from loopwright.pipeline.export.fusion.values import Block, Operand, Origin, Value, whole
 
 if TYPE_CHECKING:
-    from pipeline.export.fusion.reading import Reading
+    from loopwright.pipeline.export.fusion.reading import Reading
 
 DOUBLE = onnx.TensorProto.DOUBLE
 BROADCASTING = frozenset({"Mul", "Div", "Min", "Max", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Equal"})

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from pipeline.export.fusion.affine import Array, Attributes, Shape
-from pipeline.export.fusion.prices import price
+from loopwright.pipeline.export.fusion.affine import Array, Attributes, Shape
+from loopwright.pipeline.export.fusion.prices import price
 
 
 class Item:

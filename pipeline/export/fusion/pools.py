@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import prod
 
-from pipeline.export.fusion.affine import Shape
-from pipeline.export.fusion.plan import Item, Member, Pool
-from pipeline.export.fusion.prices import FIXED, INPUT, OUTPUT, product
-from pipeline.export.fusion.values import Block, Value
+from loopwright.pipeline.export.fusion.affine import Shape
+from loopwright.pipeline.export.fusion.plan import Item, Member, Pool
+from loopwright.pipeline.export.fusion.prices import FIXED, INPUT, OUTPUT, product
+from loopwright.pipeline.export.fusion.values import Block, Value
 
 
 class Selection(Pool):

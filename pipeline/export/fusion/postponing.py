@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from pipeline.export.fusion.items import Items
-from pipeline.export.fusion.plan import Choice, Item, Member
-from pipeline.export.fusion.pools import Selection
-from pipeline.export.fusion.values import Value
+from loopwright.pipeline.export.fusion.items import Items
+from loopwright.pipeline.export.fusion.plan import Choice, Item, Member
+from loopwright.pipeline.export.fusion.pools import Selection
+from loopwright.pipeline.export.fusion.values import Value
 
 LEVELS = 3  # so much later at most
 

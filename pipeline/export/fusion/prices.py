@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import prod
 
-from pipeline.export.fusion.affine import Shape
+from loopwright.pipeline.export.fusion.affine import Shape
 
 DEAR = frozenset({"Tanh", "Log", "Exp", "Sigmoid", "Softmax", "Pow"})
 FIXED = {

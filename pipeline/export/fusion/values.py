@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from pipeline.export.fusion.affine import Affine, Array, Attributes, Shape
+from loopwright.pipeline.export.fusion.affine import Affine, Array, Attributes, Shape
 
 
 @dataclass(eq=False)

@@ -12,8 +12,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.errors import HostError
-from pipeline.plants.fmu.description import fmpy
+from loopwright.pipeline.errors import HostError
+from loopwright.pipeline.plants.fmu.description import fmpy
 
 HOSTS = Path(__file__).parents[1]
 SOURCES = Path(__file__).parent / "sources"

@@ -6,8 +6,8 @@ import html
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
-from pipeline.hosts.fmu.variables import Variable, in_xml, variables_of
-from serving.controller import Controller
+from loopwright.pipeline.hosts.fmu.variables import Variable, in_xml, variables_of
+from loopwright.serving.controller import Controller
 
 LOG = {
     "logStatusError": "why a call failed",

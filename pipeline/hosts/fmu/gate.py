@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import HostError
-from pipeline.hosts.fmu.variables import Variable, variables_of
-from pipeline.plants.fmu.description import described, fmpy
-from pipeline.plants.fmu.instance import Instance
-from serving.conformance.steps import answered
-from serving.controller import Controller
+from loopwright.pipeline.errors import HostError
+from loopwright.pipeline.hosts.fmu.variables import Variable, variables_of
+from loopwright.pipeline.plants.fmu.description import described, fmpy
+from loopwright.pipeline.plants.fmu.instance import Instance
+from loopwright.serving.conformance.steps import answered
+from loopwright.serving.controller import Controller
 
 
 def check(controller: Controller, fmu: Path, folder: Path) -> int:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from pipeline.errors import HostError
-from serving.manifest import Manifest, Signal
+from loopwright.pipeline.errors import HostError
+from loopwright.serving.manifest import Manifest, Signal
 
 TIME, FAULT, USE_APPLIED, FIRST = range(4)  # value references; FIRST: of the first signal
 READ_BACK = "the MV that the plant received over the last period"

@@ -8,10 +8,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import Stepped, hold_numbers
-from pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, FuzzyParams, require_shares
-from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
-from pipeline.plants.signals import Signals
+from loopwright.pipeline.laws.base import Stepped, hold_numbers
+from loopwright.pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, FuzzyParams, require_shares
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
+from loopwright.pipeline.plants.signals import Signals
 
 
 class FuzzyFeedforwardObserver(FuzzyLaw):

@@ -10,12 +10,12 @@ from typing import Any, ClassVar, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, hold_numbers
-from pipeline.models.base import Model
-from pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import ControlLaw, hold_numbers
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 TIE = 1e-9  # [degC] what two modes may differ by through rounding alone
 

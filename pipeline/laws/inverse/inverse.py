@@ -10,12 +10,12 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_part, require_single_loop
-from pipeline.models.base import Model
-from pipeline.models.static.leverage_domain import Interval, LeverageDomain
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_part, require_single_loop
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.static.leverage_domain import Interval, LeverageDomain
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 
 class INC(ControlLaw):

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.base import (
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import (
     Analysis,
     ControlLaw,
     Stepped,
@@ -20,14 +20,14 @@ from pipeline.laws.base import (
     require_part,
     require_single_loop,
 )
-from pipeline.laws.inverse.learnt_parts import learnt_parts
-from pipeline.laws.inverse.self_chosen import LONGEST, Choice
-from pipeline.laws.ranges import OfRange, in_units
-from pipeline.models.base import Model
-from pipeline.models.identified.identified import Identified
-from pipeline.models.static.candidates import candidates
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.laws.inverse.learnt_parts import learnt_parts
+from loopwright.pipeline.laws.inverse.self_chosen import LONGEST, Choice
+from loopwright.pipeline.laws.ranges import OfRange, in_units
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.static.candidates import candidates
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 # Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
 FOLLOWED = 1e-3

@@ -6,15 +6,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.inverse.self_chosen import LANES, SEED, Choice, branches
-from pipeline.models.base import Model
-from pipeline.models.identified.identified import Identified
-from pipeline.models.static.mlp import MLP
-from pipeline.models.training.fit import LevenbergMarquardt
-from pipeline.models.training.objectives import Samples
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.inverse.self_chosen import LANES, SEED, Choice, branches
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.training.fit import LevenbergMarquardt
+from loopwright.pipeline.models.training.objectives import Samples
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
 
 HIDDEN, ITERATIONS, TRAIN = (10,), 60, 0.8
 PARTITIONS = 10  # of the inverse
@@ -74,7 +74,9 @@ def _network(rows: Array, target: Array, residual: int) -> MLP:
 
 def _inverse(forward: Model, rows: Array) -> Model:
     """A radial basis function network [pv, w] -> mv, of w = forward(pv, mv) over the rows."""
-    from pipeline.models.static.fuzzy_means import FuzzyMeansRBF  # scikit-learn is slow to import, few need it
+    from loopwright.pipeline.models.static.fuzzy_means import (
+        FuzzyMeansRBF,  # scikit-learn is slow to import, few need it
+    )
 
     with torch.no_grad():
         w = forward(torch.from_numpy(rows)).numpy()

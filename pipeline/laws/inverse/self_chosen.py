@@ -9,11 +9,11 @@ from typing import Self
 import numpy as np
 import torch
 
-from pipeline.errors import LawError
-from pipeline.laws.base import Analysis
-from pipeline.models.identified.identified import Identified
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import Analysis
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
 
 CLEAR = 10.0  # times its noise: an answer over half the MV's range that says enough of the MV
 CALM = 0.9  # largest closed-loop eigenvalue that a horizon is taken for at once

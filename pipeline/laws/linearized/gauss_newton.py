@@ -9,16 +9,16 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.adaptive import move, signed_unit, target, target_slots
-from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
-from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid, central_model, next_output
-from pipeline.laws.ranges import OfRange, in_units
-from pipeline.models.base import Model
-from pipeline.models.lagged.next_output import GaussNewton
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Memory
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.laws.adaptive import move, signed_unit, target, target_slots
+from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
+from loopwright.pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid, central_model, next_output
+from loopwright.pipeline.laws.ranges import OfRange, in_units
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.lagged.next_output import GaussNewton
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.memory import Memory
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 
 def room(law: ControlLaw, u: Tensor, unit: Tensor, *, turned: bool) -> tuple[Tensor, Tensor]:

@@ -9,14 +9,14 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from pipeline.laws.adaptive import move, target
-from pipeline.laws.base import Stepped, hold_numbers
-from pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid
-from pipeline.laws.ranges import ascend, in_units
-from pipeline.models.lagged.next_output import Ahead
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Named, Slot
-from pipeline.plants.signals import Signals
+from loopwright.pipeline.laws.adaptive import move, target
+from loopwright.pipeline.laws.base import Stepped, hold_numbers
+from loopwright.pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid
+from loopwright.pipeline.laws.ranges import ascend, in_units
+from loopwright.pipeline.models.lagged.next_output import Ahead
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.memory import Named, Slot
+from loopwright.pipeline.plants.signals import Signals
 
 DOUBLINGS = 12
 

@@ -8,16 +8,16 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
-from pipeline.errors import LawError, ModelError
-from pipeline.laws.adaptive import AdaptiveParams, AdaptivePid
-from pipeline.laws.base import require_kind
-from pipeline.models.base import Model
-from pipeline.models.lagged.instantaneous import Arx, arx
-from pipeline.models.lagged.next_output import Ahead, NextOutput
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Named, Slot
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.errors import LawError, ModelError
+from loopwright.pipeline.laws.adaptive import AdaptiveParams, AdaptivePid
+from loopwright.pipeline.laws.base import require_kind
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.lagged.instantaneous import Arx, arx
+from loopwright.pipeline.models.lagged.next_output import Ahead, NextOutput
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.memory import Named, Slot
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 
 @dataclass(frozen=True, slots=True)

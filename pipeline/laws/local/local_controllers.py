@@ -9,14 +9,14 @@ from typing import ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, ControlLaw, Stepped, hold_numbers, require_single_loop
-from pipeline.laws.local.local_stability import StabilityTest, stability_analysis
-from pipeline.laws.stuck_actuator import never_given, stood_still
-from pipeline.models.local.local_models import LocalModels
-from pipeline.plants.equations import equations
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, hold_numbers, require_single_loop
+from loopwright.pipeline.laws.local.local_stability import StabilityTest, stability_analysis
+from loopwright.pipeline.laws.stuck_actuator import never_given, stood_still
+from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.plants.equations import equations
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 Blending = Literal["gains", "outputs", "velocity"]
 

@@ -9,12 +9,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.engine.parallel import parallel_map
-from pipeline.laws.base import Analysis, ControlLaw
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.simulator import Array
-from pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
-from pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.laws.base import Analysis, ControlLaw
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
+from loopwright.pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
 
 BATCH = 500  # loops that run side by side in one piece
 SAME = 1e-3  # relative difference of two states that count as one

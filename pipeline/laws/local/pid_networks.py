@@ -8,15 +8,15 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from pipeline.errors import LawError
-from pipeline.laws.base import require_kind
-from pipeline.laws.local.local_controllers import BlendedParams, LocalControllers, LocalPid
-from pipeline.models.base import Model
-from pipeline.models.local.local_models import LocalModels
-from pipeline.plants.linearization import Linearization
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.tuning.rules import AllPole
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import require_kind
+from loopwright.pipeline.laws.local.local_controllers import BlendedParams, LocalControllers, LocalPid
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.tuning.rules import AllPole
 
 DAMPING = 2.6  # of the triple of closed-loop poles: s^3 + 2.6 wc s^2 + 2.6 wc^2 s + wc^3
 LEAST_DAMPING = 2.56  # 4 zeta^2 with zeta = 0.8, where a PI alone bounds the damping

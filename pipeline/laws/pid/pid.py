@@ -12,21 +12,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
-from pipeline.laws.pid.tuned import by_simulation, given_pairs, linearization, require_numbers, tuned
-from pipeline.laws.rates import Rates
-from pipeline.laws.stuck_actuator import never_given, stood_still
-from pipeline.models.base import Model
-from pipeline.plants.equations import equations
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.tuning.loop_search import Loops
-from pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, choice_words, pairings
-from pipeline.tuning.pid_forms import PidForms, whole_span
-from pipeline.tuning.responses import StepResponses
-from pipeline.tuning.rules import AllPole, PidSettings
-from pipeline.tuning.stability import FrozenLoops, spectral_radius
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
+from loopwright.pipeline.laws.pid.tuned import by_simulation, given_pairs, linearization, require_numbers, tuned
+from loopwright.pipeline.laws.rates import Rates
+from loopwright.pipeline.laws.stuck_actuator import never_given, stood_still
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.plants.equations import equations
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.tuning.loop_search import Loops
+from loopwright.pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, choice_words, pairings
+from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span
+from loopwright.pipeline.tuning.responses import StepResponses
+from loopwright.pipeline.tuning.rules import AllPole, PidSettings
+from loopwright.pipeline.tuning.stability import FrozenLoops, spectral_radius
 
 EXAMINED = 40  # linear closed loops over a range of the CV
 

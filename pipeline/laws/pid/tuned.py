@@ -8,20 +8,20 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from pipeline.errors import LawError
-from pipeline.laws.base import ControlLaw, require_single_loop
-from pipeline.models.base import Model
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.linearization import Linearization
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.tuning import rules
-from pipeline.tuning.development import DevelopmentLoops
-from pipeline.tuning.loop_search import Loops, searched
-from pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, gains_of, pairings
-from pipeline.tuning.reduction import LagWithDeadTime, start_lag
-from pipeline.tuning.responses import StepResponses
-from pipeline.tuning.rules import AllPole, PidSettings
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import ControlLaw, require_single_loop
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.tuning import rules
+from loopwright.pipeline.tuning.development import DevelopmentLoops
+from loopwright.pipeline.tuning.loop_search import Loops, searched
+from loopwright.pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, gains_of, pairings
+from loopwright.pipeline.tuning.reduction import LagWithDeadTime, start_lag
+from loopwright.pipeline.tuning.responses import StepResponses
+from loopwright.pipeline.tuning.rules import AllPole, PidSettings
 
 HOLD = 100  # samples of a development set point
 TIMES, CROSSINGS = 2, 3  # where it lasts so many times as long as the plant takes to settle, or to cross its range

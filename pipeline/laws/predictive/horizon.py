@@ -10,14 +10,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from pipeline.laws.base import hold_numbers
-from pipeline.laws.predictive.loads import Loads
-from pipeline.laws.predictive.moves import Moves
-from pipeline.laws.predictive.one_step import one_step
-from pipeline.laws.predictive.product import product
-from pipeline.models.affine_map import AffineMap
-from pipeline.models.identified.identified import Identified
-from pipeline.models.memory import Named
+from loopwright.pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.predictive.loads import Loads
+from loopwright.pipeline.laws.predictive.moves import Moves
+from loopwright.pipeline.laws.predictive.one_step import one_step
+from loopwright.pipeline.laws.predictive.product import product
+from loopwright.pipeline.models.affine_map import AffineMap
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.memory import Named
 
 Scaling = Callable[[Tensor], Tensor]
 """The scaled MVs (..., n_mv) of a model for MVs (..., n_mv) within -1..1."""

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 import torch
 from torch import Tensor
 
-from pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.identified import Identified
 
 Where: TypeAlias = Literal["mvs", "outputs"]
 GROWTH = 1 / 3  # scaled, a sample: largest growth of the outputs under a unit load at an MV

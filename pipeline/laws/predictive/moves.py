@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.plants.simulator import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from pipeline.laws.base import hold_numbers
-from pipeline.laws.predictive.loads import Loads
-from pipeline.laws.predictive.one_step import one_step
-from pipeline.laws.predictive.product import product
-from pipeline.models.affine_map import AffineMap
-from pipeline.models.identified.identified import Identified
+from loopwright.pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.predictive.loads import Loads
+from loopwright.pipeline.laws.predictive.one_step import one_step
+from loopwright.pipeline.laws.predictive.product import product
+from loopwright.pipeline.models.affine_map import AffineMap
+from loopwright.pipeline.models.identified.identified import Identified
 
 NOISE_FLOOR = (
     1e-2  # scaled; a model that claims less noise would believe rounding, and lose the digits of its covariance

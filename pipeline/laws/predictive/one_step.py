@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pipeline.laws.predictive.loads import Loads
-from pipeline.models.identified.identified import Identified
-from pipeline.models.memory import Named
+from loopwright.pipeline.laws.predictive.loads import Loads
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.memory import Named
 
 
 def one_step(model: Identified, loads: Loads, p: Named) -> dict[str, Tensor]:

@@ -8,12 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.errors import LawError
-from pipeline.laws.predictive.loads import Where
-from pipeline.laws.rates import Rates
-from pipeline.models.identified.identified import Identified
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.predictive.loads import Where
+from loopwright.pipeline.laws.rates import Rates
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
 
 LONGEST = 500  # samples of a horizon: the law's graph and its design grow with each
 Limits = tuple[float | None, ...] | None

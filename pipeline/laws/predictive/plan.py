@@ -9,11 +9,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import hardtanh
 
-from pipeline.laws.base import hold_numbers
-from pipeline.laws.predictive.horizon import LinearHorizon, NetworkHorizon
-from pipeline.laws.predictive.moves import Moves
-from pipeline.laws.predictive.product import product
-from pipeline.laws.predictive.soft_limits import SoftLimits
+from loopwright.pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, NetworkHorizon
+from loopwright.pipeline.laws.predictive.moves import Moves
+from loopwright.pipeline.laws.predictive.product import product
+from loopwright.pipeline.laws.predictive.soft_limits import SoftLimits
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,26 +9,32 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
-from pipeline.laws.predictive.horizon import horizon_of
-from pipeline.laws.predictive.loads import Loads, balanced, held_rest, loads_of
-from pipeline.laws.predictive.moves import Moves
-from pipeline.laws.predictive.observer import Estimate, Noises, Observer, load_variance
-from pipeline.laws.predictive.params import PredictiveParams, check_sizes, limits_of, refuse_discrete, weights_of
-from pipeline.laws.predictive.plan import Cost, Planner
-from pipeline.laws.predictive.set_points import SetPoints
-from pipeline.laws.predictive.settling import horizon_for, mvs_of, refuse_unstable
-from pipeline.laws.predictive.sight import Sight
-from pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
-from pipeline.laws.predictive.trials import Trials
-from pipeline.laws.predictive.tuning import Candidate, calmest, in_words, tuned
-from pipeline.models.affine_map import AffineMap
-from pipeline.models.base import Model
-from pipeline.models.identified.identified import Identified
-from pipeline.models.memory import Named
-from pipeline.plants.noise import level_gain
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
+from loopwright.pipeline.laws.predictive.horizon import horizon_of
+from loopwright.pipeline.laws.predictive.loads import Loads, balanced, held_rest, loads_of
+from loopwright.pipeline.laws.predictive.moves import Moves
+from loopwright.pipeline.laws.predictive.observer import Estimate, Noises, Observer, load_variance
+from loopwright.pipeline.laws.predictive.params import (
+    PredictiveParams,
+    check_sizes,
+    limits_of,
+    refuse_discrete,
+    weights_of,
+)
+from loopwright.pipeline.laws.predictive.plan import Cost, Planner
+from loopwright.pipeline.laws.predictive.set_points import SetPoints
+from loopwright.pipeline.laws.predictive.settling import horizon_for, mvs_of, refuse_unstable
+from loopwright.pipeline.laws.predictive.sight import Sight
+from loopwright.pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
+from loopwright.pipeline.laws.predictive.trials import Trials
+from loopwright.pipeline.laws.predictive.tuning import Candidate, calmest, in_words, tuned
+from loopwright.pipeline.models.affine_map import AffineMap
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.memory import Named
+from loopwright.pipeline.plants.noise import level_gain
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 
 class Predictive(ControlLaw):

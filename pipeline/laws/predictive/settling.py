@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.models.identified.identified import Identified
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.simulator import Array
 
 LEVELS = (-0.8, -0.4, 0.0, 0.4, 0.8)  # of an MV in its range -1..1, the others in the middle of theirs
 STEP = 0.3  # of an MV, up and down

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.predictive.settling import AFTER, LEAST_ANSWER, SHARE, settling_times, step_responses
-from pipeline.models.identified.identified import Identified
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.predictive.settling import AFTER, LEAST_ANSWER, SHARE, settling_times, step_responses
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.simulator import Array
 
 BEGUN = 0.01  # share of the change within AFTER samples, from which an answer has begun
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.base import hold_numbers
 
 PRICE = 30.0  # of a scaled unit beyond a limit, in units of the largest weight of an error
 EPS = 0.03  # scaled: what lies beyond a limit by less counts by its square

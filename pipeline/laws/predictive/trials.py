@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import ControlLaw
-from pipeline.models.identified.identified import Identified
-from pipeline.plants.identified import StateEquation, shift_rows
-from pipeline.plants.noise import coloured, deviation
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
-from pipeline.plants.spoilt import likely_error
+from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.identified import StateEquation, shift_rows
+from loopwright.pipeline.plants.noise import coloured, deviation
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.spoilt import likely_error
 
 LOOPS = 6  # with set points, and as many with loads
 HOLDS = 5  # set points of a loop, and steps of its loads

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.errors import LawError, ModelError
-from pipeline.laws.base import require_kind
-from pipeline.models.base import Model
-from pipeline.models.lagged.arx import ARX
-from pipeline.models.lagged.recursive import RecursiveLeastSquares
-from pipeline.models.lagged.recursive_arx import RecursiveArx
-from pipeline.plants.signals import Signals
+from loopwright.pipeline.errors import LawError, ModelError
+from loopwright.pipeline.laws.base import require_kind
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.lagged.arx import ARX
+from loopwright.pipeline.models.lagged.recursive import RecursiveLeastSquares
+from loopwright.pipeline.models.lagged.recursive_arx import RecursiveArx
+from loopwright.pipeline.plants.signals import Signals
 
 
 def require_arx(models: Mapping[str, Model], law: str) -> ARX:

@@ -9,15 +9,15 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, move, target
-from pipeline.laws.base import Stepped, hold_numbers
-from pipeline.laws.recursive.arx_law import estimator, require_arx
-from pipeline.models.base import Model
-from pipeline.models.lagged.arx import ARX
-from pipeline.models.lagged.recursive_arx import RecursiveArx
-from pipeline.models.memory import Slot
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, move, target
+from loopwright.pipeline.laws.base import Stepped, hold_numbers
+from loopwright.pipeline.laws.recursive.arx_law import estimator, require_arx
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.lagged.arx import ARX
+from loopwright.pipeline.models.lagged.recursive_arx import RecursiveArx
+from loopwright.pipeline.models.memory import Slot
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 
 class RecursivePid(AdaptivePid):

@@ -9,16 +9,16 @@ from typing import Any, ClassVar, Literal, Self
 import torch
 from torch import Tensor
 
-from pipeline.laws.adaptive import signed_unit
-from pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_single_loop
-from pipeline.laws.gain_update import PidForm
-from pipeline.laws.ranges import OfRange, in_units
-from pipeline.laws.recursive.arx_law import estimator, require_arx
-from pipeline.models.base import Model
-from pipeline.models.lagged.arx import ARX
-from pipeline.models.memory import Memory, Slot
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
+from loopwright.pipeline.laws.adaptive import signed_unit
+from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_single_loop
+from loopwright.pipeline.laws.gain_update import PidForm
+from loopwright.pipeline.laws.ranges import OfRange, in_units
+from loopwright.pipeline.laws.recursive.arx_law import estimator, require_arx
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.lagged.arx import ARX
+from loopwright.pipeline.models.memory import Memory, Slot
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
 
 TERMS = 3  # of F: more would be no PID
 

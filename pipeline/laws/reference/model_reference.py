@@ -9,14 +9,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.laws.base import Analysis, Stepped, hold_numbers
-from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
-from pipeline.laws.reference.reference_networks import BEFORE, COURSE, IncrementalNetwork, R, TwoErrorNetwork, U, Y
-from pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
-from pipeline.models.base import Model
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.tuning.reference_model import ReferenceModel
+from loopwright.pipeline.laws.base import Analysis, Stepped, hold_numbers
+from loopwright.pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
+from loopwright.pipeline.laws.reference.reference_networks import (
+    BEFORE,
+    COURSE,
+    IncrementalNetwork,
+    R,
+    TwoErrorNetwork,
+    U,
+    Y,
+)
+from loopwright.pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
 POINTS = 21  # of MV and CV each, at which the roots are looked for
 ERRORS = np.geomspace(1e-4, 1.0, 41)  # of the CV's range

@@ -8,16 +8,16 @@ from typing import Any, ClassVar, Literal, Self
 
 from torch import Tensor
 
-from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, Stepped, require_single_loop
-from pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
-from pipeline.laws.reference.reference_networks import TrainablePi
-from pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
-from pipeline.models.base import Model
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Simulator
-from pipeline.tuning.reference_model import ReferenceModel
-from pipeline.tuning.rules import PidSettings
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import Analysis, Stepped, require_single_loop
+from loopwright.pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
+from loopwright.pipeline.laws.reference.reference_networks import TrainablePi
+from loopwright.pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.tuning.reference_model import ReferenceModel
+from loopwright.pipeline.tuning.rules import PidSettings
 
 
 class PiReference(ReferenceLaw):

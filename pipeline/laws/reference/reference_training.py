@@ -9,17 +9,17 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 import torch
 
-from pipeline.errors import LawError
-from pipeline.laws.base import Analysis, require_kind, require_single_loop
-from pipeline.laws.reference.reference_law import ReferenceParams
-from pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
-from pipeline.laws.reference.reference_networks import Trainable
-from pipeline.models.base import Model
-from pipeline.models.state_space.state_space import StateSpace
-from pipeline.models.training.jacobian import input_jacobian
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
-from pipeline.tuning.reference_model import ReferenceModel
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.base import Analysis, require_kind, require_single_loop
+from loopwright.pipeline.laws.reference.reference_law import ReferenceParams
+from loopwright.pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
+from loopwright.pipeline.laws.reference.reference_networks import Trainable
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.state_space.state_space import StateSpace
+from loopwright.pipeline.models.training.jacobian import input_jacobian
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
 P = TypeVar("P", bound=Trainable)
 

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
 
 COEFFICIENTS = ("a1", "a2", "b", "r")
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from pipeline.errors import ModelError
-from pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 How = Literal["tied", "global", "local"]
 MODES: Mapping[int, str] = {1: "hot", 2: "cold"}

@@ -8,15 +8,15 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 import torch
 
-from pipeline.metrics import r2, rmse
-from pipeline.models.base import Model, simulate
-from pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
-from pipeline.models.fuzzy.hybrid_fuzzy_identification import MODES, Transitions, identify
-from pipeline.models.part import Learnt, Part, Source, predict
-from pipeline.models.training.regressors import split_in_time
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array, Simulator
-from pipeline.records.record import Record
+from loopwright.pipeline.metrics import r2, rmse
+from loopwright.pipeline.models.base import Model, simulate
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_identification import MODES, Transitions, identify
+from loopwright.pipeline.models.part import Learnt, Part, Source, predict
+from loopwright.pipeline.models.training.regressors import split_in_time
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.records.record import Record
 
 Identification = Literal["tied", "global", "local"]
 GRID_DEGC = 0.5  # of the search for gaps

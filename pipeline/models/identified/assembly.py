@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.rests import central_map, rest_map
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.rests import central_map, rest_map
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.plants.simulator import Array
 
 ANSWERS = 0.1
 """Share of the fastest change of an output in a step response below which it has not answered yet."""

@@ -7,21 +7,32 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.drift import error_beyond_drift
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.innovations import Innovations, PredictionError, begun, innovations, with_loads
-from pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
-from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
-from pipeline.models.identified.output_error import (
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.drift import error_beyond_drift
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.innovations import (
+    Innovations,
+    PredictionError,
+    begun,
+    innovations,
+    with_loads,
+)
+from loopwright.pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
+from loopwright.pipeline.models.identified.linear_start import (
+    Realizations,
+    dead_times,
+    high_order_arx,
+    within_unit_circle,
+)
+from loopwright.pipeline.models.identified.output_error import (
     Fitted,
     OutputError,
     fit_starts,
     residuals,
 )
-from pipeline.models.identified.rests import settle
-from pipeline.models.identified.structure import Problem, Structure
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.rests import settle
+from loopwright.pipeline.models.identified.structure import Problem, Structure
+from loopwright.pipeline.plants.simulator import Array
 
 RESPONSE = 120
 """Samples of the high-order ARX's impulse response that are realized."""

@@ -8,7 +8,7 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -10,9 +10,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipeline.models.identified.proof import UNCERTAIN, Answer
-from pipeline.models.identified.structure import Structure
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.proof import UNCERTAIN, Answer
+from loopwright.pipeline.models.identified.structure import Structure
+from loopwright.pipeline.plants.simulator import Array
 
 MOST_OPEN = 8  # answers that are open together
 DIRECTIONS = 2_000  # in which the plants that a record leaves open are looked at in each round

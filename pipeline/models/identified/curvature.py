@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.plants.simulator import Array
 
 EXPLAINED = 0.02
 """Share of a residual's variance beyond which curves count: a model with them would gain 1 % of its error."""

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.historian.pace import MOST_PERIODS
-from pipeline.plants.simulator import Array
-from pipeline.tuning.responses import reached
+from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.tuning.responses import reached
 
 RISES = (0.1, 0.63)
 """Shares of its last value between which the time of a step response is its time constant; the first ends dead time."""

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.output_error import fit_starts
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.output_error import fit_starts
+from loopwright.pipeline.plants.simulator import Array
 
 PARTS = (8, 16, 32, 64, 128)
 """Numbers of parts of the record that get a gain and a level of their own: drift may be slow or quick."""

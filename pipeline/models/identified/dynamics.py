@@ -9,9 +9,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.models.identified.compiled import hold_inputs, run_rows
-from pipeline.plants.identified import StateEquation
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.compiled import hold_inputs, run_rows
+from loopwright.pipeline.plants.identified import StateEquation
+from loopwright.pipeline.plants.simulator import Array
 
 EXPLODED = 1e4
 """Scaled state beyond which a free run is given up."""

@@ -7,8 +7,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
 
 
 class Identified(Model):

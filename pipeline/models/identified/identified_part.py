@@ -8,28 +8,28 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from pipeline.config.known import NONE
-from pipeline.models.base import Model
-from pipeline.models.identified.assembly import assembled, noise_of
-from pipeline.models.identified.candidates import on_all_rows, within_limits
-from pipeline.models.identified.coupling import sign_margin, unused_answers
-from pipeline.models.identified.doubt import colour_of, doubt_of
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
-from pipeline.models.identified.known_answers import known_figures
-from pipeline.models.identified.network_search import UNITS
-from pipeline.models.identified.output_error import Fitted, fit_starts, residuals
-from pipeline.models.identified.proof import Answer, answers, foreseen, proof_figures
-from pipeline.models.identified.regions import Cells
-from pipeline.models.identified.residual_tests import residual_figures
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.identified.selection import Selection
-from pipeline.models.identified.stability import stability_figures
-from pipeline.models.identified.structure import Problem, Structure
-from pipeline.models.identified.structure_search import Searched, StructureSearch
-from pipeline.models.identified.uncertainty import drawn
-from pipeline.models.identified.verdict import (
+from loopwright.pipeline.config.known import NONE
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.identified.assembly import assembled, noise_of
+from loopwright.pipeline.models.identified.candidates import on_all_rows, within_limits
+from loopwright.pipeline.models.identified.coupling import sign_margin, unused_answers
+from loopwright.pipeline.models.identified.doubt import colour_of, doubt_of
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
+from loopwright.pipeline.models.identified.known_answers import known_figures
+from loopwright.pipeline.models.identified.network_search import UNITS
+from loopwright.pipeline.models.identified.output_error import Fitted, fit_starts, residuals
+from loopwright.pipeline.models.identified.proof import Answer, answers, foreseen, proof_figures
+from loopwright.pipeline.models.identified.regions import Cells
+from loopwright.pipeline.models.identified.residual_tests import residual_figures
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.identified.selection import Selection
+from loopwright.pipeline.models.identified.stability import stability_figures
+from loopwright.pipeline.models.identified.structure import Problem, Structure
+from loopwright.pipeline.models.identified.structure_search import Searched, StructureSearch
+from loopwright.pipeline.models.identified.uncertainty import drawn
+from loopwright.pipeline.models.identified.verdict import (
     STEP,
     dead_times,
     free_run_figures,
@@ -39,12 +39,12 @@ from pipeline.models.identified.verdict import (
     response_figures,
     structure_figures,
 )
-from pipeline.models.part import Learnt, Part, Source
-from pipeline.plants.noise import noise_and_change
-from pipeline.plants.simulator import Array
-from pipeline.records.levels import levels_of, only_between
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.models.part import Learnt, Part, Source
+from loopwright.pipeline.plants.noise import noise_and_change
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.levels import levels_of, only_between
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 Figures = Mapping[str, Mapping[str, Any]]
 

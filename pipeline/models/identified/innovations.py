@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
+from loopwright.pipeline.plants.simulator import Array
 
 LOADS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Variances of a load's change a row, over that of the measurement, from which a fit may begin."""

@@ -8,11 +8,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipeline.config.known import NONE, NOTHING, Known
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.rests import central_gain
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.config.known import NONE, NOTHING, Known
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.rests import central_gain
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.plants.simulator import Array
 
 ROUNDING = 1e-6
 """Share of a period: a dead time of whole periods in seconds is that many periods."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from pipeline.config.known import NONE, NOTHING, SURE, Known
-from pipeline.historian.known_record import Beside
-from pipeline.records.record import Record
+from loopwright.pipeline.config.known import NONE, NOTHING, SURE, Known
+from loopwright.pipeline.historian.known_record import Beside
+from loopwright.pipeline.records.record import Record
 
 AGREES, OPEN, MODEL, CONTRADICTED, UNUSED = "agrees", "open", "model", "contradicted", "unused"
 

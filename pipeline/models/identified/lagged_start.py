@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.scaled_record import ScaledRecord
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.plants.simulator import Array
 
 
 def lagged_start(data: ScaledRecord, y_lags: int, v_lags: int) -> Dynamics:

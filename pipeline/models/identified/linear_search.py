@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.candidates import Start, Task
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.linear_start import within_unit_circle
-from pipeline.models.identified.rounds import Rounds
-from pipeline.models.identified.structure import Structure
-from pipeline.models.identified.trial import Trial
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.candidates import Start, Task
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.linear_start import within_unit_circle
+from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.structure import Structure
+from loopwright.pipeline.models.identified.trial import Trial
 
 MOST_STATES = 18
 """States of a lagged start beyond which it is not tried."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.scaled_record import ScaledRecord
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.plants.simulator import Array
 
 LAGS = 50
 """Most lags of the high-order ARX."""

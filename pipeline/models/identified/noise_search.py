@@ -8,16 +8,16 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.errors import ModelError
-from pipeline.historian.pace import MOST_PERIODS
-from pipeline.models.identified.assembly import step_responses
-from pipeline.models.identified.candidates import Task
-from pipeline.models.identified.innovations import innovations
-from pipeline.models.identified.linear_search import LinearSearch
-from pipeline.models.identified.rounds import Rounds
-from pipeline.models.identified.structure import Problem, Structure
-from pipeline.models.identified.trial import Trial
-from pipeline.tuning.responses import reached
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.models.identified.assembly import step_responses
+from loopwright.pipeline.models.identified.candidates import Task
+from loopwright.pipeline.models.identified.innovations import innovations
+from loopwright.pipeline.models.identified.linear_search import LinearSearch
+from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.structure import Problem, Structure
+from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.tuning.responses import reached
 
 ITERATIONS = 20
 """Iterations of a linear fit."""

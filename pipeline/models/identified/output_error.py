@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from pipeline.models.identified.dynamics import EXPLODED, Dynamics, Stretch
-from pipeline.models.identified.sensitivities import Equations, sensitivity_sums
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.dynamics import EXPLODED, Dynamics, Stretch
+from loopwright.pipeline.models.identified.sensitivities import Equations, sensitivity_sums
+from loopwright.pipeline.plants.simulator import Array
 
 GROWTH = 1e10  # of the damping, after which no step is looked for
 

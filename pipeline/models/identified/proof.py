@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config.known import SURE
-from pipeline.historian.direct import DirectModel
-from pipeline.historian.feedback import follows
-from pipeline.models.identified.innovations import innovations
-from pipeline.models.identified.linear_start import high_order_arx
-from pipeline.models.identified.regions import SMALL, Cells, alike, pieces
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.identified.structure import Problem, Structure
-from pipeline.models.identified.trial import Trial
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.config.known import SURE
+from loopwright.pipeline.historian.direct import DirectModel
+from loopwright.pipeline.historian.feedback import follows
+from loopwright.pipeline.models.identified.innovations import innovations
+from loopwright.pipeline.models.identified.linear_start import high_order_arx
+from loopwright.pipeline.models.identified.regions import SMALL, Cells, alike, pieces
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.identified.structure import Problem, Structure
+from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 PROVEN, UNCERTAIN, OPPOSITE, HALVES, SIZE = "proven", "uncertain", "opposite", "halves", "size"
 TURNS, FADES = "turns", "fades"  # what holds by its regions

@@ -13,10 +13,10 @@ from typing import Self
 
 import numpy as np
 
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.rests import central_map, settle
-from pipeline.models.identified.scaled_record import ScaledRecord
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.rests import central_map, settle
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.plants.simulator import Array
 
 EDGES = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95)  # quantiles of an MV over its data between which its cells lie
 NARROW = 0.05  # of the way between the outer edges: an edge that is nearer to the one before is left out

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array
 
 LAGS = 25
 """Lags of the residual's correlations."""

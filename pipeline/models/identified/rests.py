@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.scaled_record import ScaledRecord
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.plants.simulator import Array
 
 INTEGRATES = 0.999
 """Pole of a model beyond which it counts as one that integrates."""

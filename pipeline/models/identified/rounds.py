@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from pipeline.engine.parallel import parallel_map
-from pipeline.models.identified.candidates import Start, Task, find_start, fit, judged_beyond_drift
-from pipeline.models.identified.output_error import Fitted
-from pipeline.models.identified.structure import Budget, Problem, Structure
-from pipeline.models.identified.trial import Trial
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.models.identified.candidates import Start, Task, find_start, fit, judged_beyond_drift
+from loopwright.pipeline.models.identified.output_error import Fitted
+from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure
+from loopwright.pipeline.models.identified.trial import Trial
 
 
 @dataclass(frozen=True, slots=True, eq=False)

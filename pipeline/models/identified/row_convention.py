@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.models.identified.scaled_record import ScaledRecord
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.plants.simulator import Array
 
 LAGS = 12
 """Lags of the ARX whose innovations are looked at."""

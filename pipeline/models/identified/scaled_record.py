@@ -10,12 +10,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.dynamics import Stretch
-from pipeline.models.training.objectives import check_finite
-from pipeline.models.training.regressors import split_in_time
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.dynamics import Stretch
+from loopwright.pipeline.models.training.objectives import check_finite
+from loopwright.pipeline.models.training.regressors import split_in_time
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 HELD_OUT = 0.2
 """Share of the rows that a fold holds out: the last ones in the first fold, the first ones in the second."""

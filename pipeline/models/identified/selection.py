@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.models.identified.candidates import RESTS, misses, rests_under
-from pipeline.models.identified.curvature import curved
-from pipeline.models.identified.drift import Drift, drift_of
-from pipeline.models.identified.linear_search import LinearSearch, smallest_first
-from pipeline.models.identified.network_search import NetworkSearch
-from pipeline.models.identified.noise_search import NATS, NETWORK_NATS, NoiseSearch, likely_dead_times, nats
-from pipeline.models.identified.rests import INTEGRATES
-from pipeline.models.identified.rounds import Rounds
-from pipeline.models.identified.row_convention import may_act_in_its_row
-from pipeline.models.identified.structure import FARTHEST, Problem
-from pipeline.models.identified.trial import Trial, best_of
+from loopwright.pipeline.models.identified.candidates import RESTS, misses, rests_under
+from loopwright.pipeline.models.identified.curvature import curved
+from loopwright.pipeline.models.identified.drift import Drift, drift_of
+from loopwright.pipeline.models.identified.linear_search import LinearSearch, smallest_first
+from loopwright.pipeline.models.identified.network_search import NetworkSearch
+from loopwright.pipeline.models.identified.noise_search import NATS, NETWORK_NATS, NoiseSearch, likely_dead_times, nats
+from loopwright.pipeline.models.identified.rests import INTEGRATES
+from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.row_convention import may_act_in_its_row
+from loopwright.pipeline.models.identified.structure import FARTHEST, Problem
+from loopwright.pipeline.models.identified.trial import Trial, best_of
 
 SETTLES = 0.98
 """Slowest pole of a fold up to which it speaks for a plant that settles, where another one integrates."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.linalg import lapack
 
-from pipeline.models.identified.compiled import propagate
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.compiled import propagate
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.plants.simulator import Array
 
 CHUNK = 256  # rows whose sensitivities are held at a time
 

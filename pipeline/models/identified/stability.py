@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.historian.pace import MOST_PERIODS
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.rests import settle
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.rests import settle
+from loopwright.pipeline.plants.simulator import Array
 
 PLACES = 2000
 """Most visited rows at which the local poles are taken."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from pipeline.models.identified.dynamics import Stretch
-from pipeline.models.identified.knowledge import NOTHING_KNOWN, Knowledge
-from pipeline.models.identified.scaled_record import Fold, ScaledRecord
+from loopwright.pipeline.models.identified.dynamics import Stretch
+from loopwright.pipeline.models.identified.knowledge import NOTHING_KNOWN, Knowledge
+from loopwright.pipeline.models.identified.scaled_record import Fold, ScaledRecord
 
 FARTHEST = 20.0
 """Scaled output that no rest of a usable network exceeds, of a plant whose linear model has nearer ones."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from pipeline.historian.feedback import fed_back
-from pipeline.historian.known_record import Beside, beside_record
-from pipeline.models.identified.knowledge import Knowledge
-from pipeline.models.identified.rounds import Rounds
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds, informative
-from pipeline.models.identified.selection import Selection, select
-from pipeline.models.identified.structure import Budget, Problem
-from pipeline.models.part import Groundwork, Source
+from loopwright.pipeline.historian.feedback import fed_back
+from loopwright.pipeline.historian.known_record import Beside, beside_record
+from loopwright.pipeline.models.identified.knowledge import Knowledge
+from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds, informative
+from loopwright.pipeline.models.identified.selection import Selection, select
+from loopwright.pipeline.models.identified.structure import Budget, Problem
+from loopwright.pipeline.models.part import Groundwork, Source
 
 MINUTES = 2.0
 """Budget for each output, in minutes of one core."""

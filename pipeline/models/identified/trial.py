@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.models.identified.output_error import Fitted
-from pipeline.models.identified.structure import Structure
+from loopwright.pipeline.models.identified.output_error import Fitted
+from loopwright.pipeline.models.identified.structure import Structure
 
 
 @dataclass(frozen=True, slots=True, eq=False)

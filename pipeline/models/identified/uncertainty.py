@@ -7,10 +7,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.output_error import residuals
-from pipeline.models.identified.sensitivities import sensitivity_sums
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.output_error import residuals
+from loopwright.pipeline.models.identified.sensitivities import sensitivity_sums
+from loopwright.pipeline.plants.simulator import Array
 
 FLAT = 1e-7
 """Eigenvalue of J'J, relative to the largest, below which a direction of the parameters changes no output."""

@@ -8,20 +8,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.historian.pace import MOST_PERIODS
-from pipeline.metrics import fit_percent
-from pipeline.models.identified.assembly import dead_periods, step_responses
-from pipeline.models.identified.doubt import spread
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.innovations import AHEAD, Innovations, ahead
-from pipeline.models.identified.output_error import fit_starts
-from pipeline.models.identified.rests import INTEGRATES, LONG, central_map, middle_rest, settle, steady_gain
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.identified.selection import Selection
-from pipeline.models.identified.structure import Problem
-from pipeline.models.identified.trial import Trial
-from pipeline.plants.simulator import Array
-from serving.manifest import Signal
+from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.metrics import fit_percent
+from loopwright.pipeline.models.identified.assembly import dead_periods, step_responses
+from loopwright.pipeline.models.identified.doubt import spread
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.innovations import AHEAD, Innovations, ahead
+from loopwright.pipeline.models.identified.output_error import fit_starts
+from loopwright.pipeline.models.identified.rests import INTEGRATES, LONG, central_map, middle_rest, settle, steady_gain
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.identified.selection import Selection
+from loopwright.pipeline.models.identified.structure import Problem
+from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.manifest import Signal
 
 QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Places of an input over its data at which the local gain is taken."""

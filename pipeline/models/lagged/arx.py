@@ -8,12 +8,12 @@ from typing import ClassVar, Self
 import numpy as np
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.metrics import fit_percent, r2, rmse
-from pipeline.models.lagged.lagged import LaggedModel, mvs_of
-from pipeline.models.part import Learnt, Part, Source, predict
-from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.metrics import fit_percent, r2, rmse
+from loopwright.pipeline.models.lagged.lagged import LaggedModel, mvs_of
+from loopwright.pipeline.models.part import Learnt, Part, Source, predict
+from loopwright.pipeline.models.training.regressors import nnarx_pairs
+from loopwright.pipeline.plants.simulator import Array
 
 
 class ARX(LaggedModel):

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from pipeline.errors import ModelError
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.static.mlp import scaled_layers
-from pipeline.models.training.jacobian import input_jacobian
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.static.mlp import scaled_layers
+from loopwright.pipeline.models.training.jacobian import input_jacobian
 
 
 class Linearized(NamedTuple):

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model
-from pipeline.models.training.objectives import Windows, free_run
-from pipeline.models.training.regressors import Pairs, nnarx_pairs
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.training.objectives import Windows, free_run
+from loopwright.pipeline.models.training.regressors import Pairs, nnarx_pairs
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 
 class LaggedModel(Model):

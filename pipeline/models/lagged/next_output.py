@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from pipeline.models.lagged.instantaneous import AlongMv
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.memory import Named, Slot, lag_slots, regressors
+from loopwright.pipeline.models.lagged.instantaneous import AlongMv
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.memory import Named, Slot, lag_slots, regressors
 
 
 class Ahead(NamedTuple):

@@ -7,9 +7,9 @@ from typing import ClassVar, Self
 
 from torch import Tensor
 
-from pipeline.models.lagged.lagged import LaggedModel, mvs_of
-from pipeline.models.static.mlp import MLP
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.lagged.lagged import LaggedModel, mvs_of
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.plants.simulator import Array
 
 
 class NNARX(LaggedModel):

@@ -9,18 +9,18 @@ from typing import Any, ClassVar
 
 import torch
 
-from pipeline.engine.parallel import parallel_map
-from pipeline.errors import ModelError
-from pipeline.metrics import fit_percent, rmse
-from pipeline.models.base import Model
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.lagged.one_step import FORGETTING, compare_one_step
-from pipeline.models.part import Learnt, Part, Source, accuracy, predict
-from pipeline.models.training.fit import FitHistory
-from pipeline.models.training.network_parts import LongRun, curves, fit_figures, fit_in_two, trainer_of
-from pipeline.models.training.objectives import Samples
-from pipeline.models.training.regressors import longest_run, nnarx_pairs, split_in_time
-from pipeline.records.record import Record
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.metrics import fit_percent, rmse
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.one_step import FORGETTING, compare_one_step
+from loopwright.pipeline.models.part import Learnt, Part, Source, accuracy, predict
+from loopwright.pipeline.models.training.fit import FitHistory
+from loopwright.pipeline.models.training.network_parts import LongRun, curves, fit_figures, fit_in_two, trainer_of
+from loopwright.pipeline.models.training.objectives import Samples
+from loopwright.pipeline.models.training.regressors import longest_run, nnarx_pairs, split_in_time
+from loopwright.pipeline.records.record import Record
 
 SLACK = 0.05
 """Relative free-run error above the best one that a smaller model may have."""

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from pipeline.errors import ModelError
-from pipeline.models.lagged.instantaneous import linearize
-from pipeline.models.lagged.nnarx import NNARX
-from pipeline.models.lagged.recursive import RecursiveLeastSquares
-from pipeline.models.training.regressors import nnarx_pairs
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.lagged.instantaneous import linearize
+from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.recursive import RecursiveLeastSquares
+from loopwright.pipeline.models.training.regressors import nnarx_pairs
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 FORGETTING = (0.8, 0.5)
 VARIANCE = 100.0

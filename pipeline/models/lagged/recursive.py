@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from pipeline.errors import ModelError
+from loopwright.pipeline.errors import ModelError
 
 # Below this the bound's step overshoots: the covariance of a direction without excitation would not settle on it.
 LEAST_BOUNDED = 0.45

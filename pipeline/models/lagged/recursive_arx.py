@@ -8,10 +8,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from pipeline.models.lagged.arx import ARX
-from pipeline.models.lagged.recursive import RecursiveLeastSquares
-from pipeline.models.memory import Named, Slot, lag_slots, regressors
-from serving.manifest import Signal
+from loopwright.pipeline.models.lagged.arx import ARX
+from loopwright.pipeline.models.lagged.recursive import RecursiveLeastSquares
+from loopwright.pipeline.models.memory import Named, Slot, lag_slots, regressors
+from loopwright.serving.manifest import Signal
 
 
 class Sample(NamedTuple):

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model
-from pipeline.models.part import Learnt, Part, Source
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.linearization import Linearization
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.part import Learnt, Part, Source
+from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.simulator import Array
 
 
 class Linearized(Model):

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model
-from pipeline.plants.equations import EquationPlant
-from pipeline.plants.linearization import Linearization
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.simulator import Array
 
 
 class Validity(nn.Module):

@@ -9,15 +9,15 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from pipeline.errors import ModelError
-from pipeline.metrics import fit_percent
-from pipeline.models.base import Model, simulate
-from pipeline.models.local.local_models import LocalModels
-from pipeline.models.part import Learnt, Part, Source
-from pipeline.plants.equations import EquationPlant, equations
-from pipeline.plants.linearization import Linearization
-from pipeline.plants.simulator import Array
-from pipeline.simulation.simulate import simulate_open
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.metrics import fit_percent
+from loopwright.pipeline.models.base import Model, simulate
+from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.models.part import Learnt, Part, Source
+from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.simulation.simulate import simulate_open
 
 STEADY_POINTS = 121  # MVs at which the network's steady state is compared with the plant's
 REST_PERIODS = 1_500  # simulated until it counts as steady

@@ -10,16 +10,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model, simulate
-from pipeline.models.part import Learnt, Part, Source, accuracy, predict
-from pipeline.models.state_space.state_windows import StateWindows
-from pipeline.models.static.mlp import MLP
-from pipeline.models.training.network_parts import LongRun, fit_figures, fit_in_two, trainer_of
-from pipeline.models.training.objectives import Samples
-from pipeline.models.training.regressors import split_in_time
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model, simulate
+from loopwright.pipeline.models.part import Learnt, Part, Source, accuracy, predict
+from loopwright.pipeline.models.state_space.state_windows import StateWindows
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.training.network_parts import LongRun, fit_figures, fit_in_two, trainer_of
+from loopwright.pipeline.models.training.objectives import Samples
+from loopwright.pipeline.models.training.regressors import split_in_time
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 
 class StateSpace(Model):

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.static.mlp import MLP
-from pipeline.models.training.jacobian import input_jacobian, parameter_jacobian
-from pipeline.models.training.objectives import Rows, Sums, check_finite, chunks
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.training.jacobian import input_jacobian, parameter_jacobian
+from loopwright.pipeline.models.training.objectives import Rows, Sums, check_finite, chunks
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pipeline.models.base import Model
-from pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.static.mlp import MLP
 
 
 def candidates(model: Model, x: Tensor, u: Tensor) -> Tensor:

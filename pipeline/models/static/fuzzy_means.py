@@ -12,10 +12,10 @@ from scipy.spatial.distance import cdist
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from pipeline.errors import ModelError
-from pipeline.models.static.least_squares import solve_qr
-from pipeline.models.static.rbf import BASES, CHUNK, RBF, Basis, design_matrix
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.static.least_squares import solve_qr
+from loopwright.pipeline.models.static.rbf import BASES, CHUNK, RBF, Basis, design_matrix
+from loopwright.pipeline.plants.simulator import Array
 
 
 def scaling(x: Array) -> tuple[Array, Array]:

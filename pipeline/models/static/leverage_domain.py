@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model
-from pipeline.models.part import Learnt, Source, StaticPart, predict
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.part import Learnt, Source, StaticPart, predict
+from loopwright.pipeline.plants.simulator import Array
 
 # Where QR leaves a column with less than this share of its spread, the column follows from the others.
 COLLINEAR = 1e-10

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.plants.simulator import Array
 
 
 class MLP(Model):

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.base import Model
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
 
 Basis = Literal["thin_plate", "gaussian"]
 BASES: tuple[str, ...] = get_args(Basis)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from pipeline.models.base import Model
-from pipeline.models.part import Learnt, Source, StaticPart, predict
-from pipeline.models.static.rbf import RBF, Basis
-from pipeline.models.training.regressors import Pairs
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.part import Learnt, Source, StaticPart, predict
+from loopwright.pipeline.models.static.rbf import RBF, Basis
+from loopwright.pipeline.models.training.regressors import Pairs
 
 if TYPE_CHECKING:
-    from pipeline.models.static.sweep import SweepResult
+    from loopwright.pipeline.models.static.sweep import SweepResult
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +55,9 @@ class RbfPart(StaticPart):
         return Learnt(model, metrics, swept, predictions)
 
     def _fit(self, train: Pairs, validation: Pairs, source: Source) -> tuple[Model, dict[str, Any]]:
-        from pipeline.models.static.fuzzy_means import FuzzyMeansRBF  # scikit-learn is slow to import, few need it
+        from loopwright.pipeline.models.static.fuzzy_means import (
+            FuzzyMeansRBF,  # scikit-learn is slow to import, few need it
+        )
 
         estimator = FuzzyMeansRBF(self.partitions, basis=self.basis, width=self.width, ridge=self.ridge)
         model = estimator.fit(train.x, train.y).to_torch()
@@ -63,7 +65,7 @@ class RbfPart(StaticPart):
         return model, metrics | {"centres": len(estimator.centres_), "c": self.partitions, "n_train": len(train)}
 
     def _swept(self, train: Pairs, validation: Pairs, source: Source) -> SweepResult:
-        from pipeline.models.static.sweep import sweep  # here, as above
+        from loopwright.pipeline.models.static.sweep import sweep  # here, as above
 
         signals = source.signals
         data = train.x, train.y, validation.x, validation.y

@@ -14,14 +14,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.engine.parallel import parallel_map
-from pipeline.errors import ModelError
-from pipeline.files import write_json
-from pipeline.metrics import per_region, r2, rmse
-from pipeline.models.static.fuzzy_means import check_parameters, grid_points, scaling, select_centres, to_grid
-from pipeline.models.static.least_squares import solve_iterative
-from pipeline.models.static.rbf import CHUNK, Basis, design_matrix
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.engine.parallel import parallel_map
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.files import write_json
+from loopwright.pipeline.metrics import per_region, r2, rmse
+from loopwright.pipeline.models.static.fuzzy_means import (
+    check_parameters,
+    grid_points,
+    scaling,
+    select_centres,
+    to_grid,
+)
+from loopwright.pipeline.models.static.least_squares import solve_iterative
+from loopwright.pipeline.models.static.rbf import CHUNK, Basis, design_matrix
+from loopwright.pipeline.plants.simulator import Array
 
 Regions = Mapping[str, tuple[float, float]]
 SHARES = 12  # pieces of a sweep

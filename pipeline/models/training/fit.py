@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
-from pipeline.errors import ModelError
-from pipeline.models.static.mlp import MLP
-from pipeline.models.training.objectives import Objective
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.training.objectives import Objective
 
 Progress = Callable[[int, float, float], None]  # iteration, train RMSE, validation RMSE
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.static.mlp import MLP
 
 
 def scaled_output(net: MLP, x: Tensor) -> Tensor:

@@ -8,14 +8,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from pipeline.config.params import choose, parse
-from pipeline.metrics import fit_percent, rmse
-from pipeline.models.base import Model
-from pipeline.models.part import Learnt, Regions, Source, StaticPart
-from pipeline.models.static.mlp import MLP
-from pipeline.models.training.fit import TRAINERS, FitHistory, Trainer
-from pipeline.models.training.objectives import Objective, Samples
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.config.params import choose, parse
+from loopwright.pipeline.metrics import fit_percent, rmse
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.part import Learnt, Regions, Source, StaticPart
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.training.fit import TRAINERS, FitHistory, Trainer
+from loopwright.pipeline.models.training.objectives import Objective, Samples
+from loopwright.pipeline.plants.simulator import Array
 
 TRAINED = ("one_step_trained", "free_run_trained")
 """Names of the network after the first training and after the second, in metrics and curves."""

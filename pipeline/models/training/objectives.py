@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.errors import ModelError
-from pipeline.models.static.mlp import MLP
-from pipeline.models.training.jacobian import input_jacobian, parameter_jacobian, scaled_output
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.models.training.jacobian import input_jacobian, parameter_jacobian, scaled_output
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 
 class Objective(Protocol):

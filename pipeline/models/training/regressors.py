@@ -8,9 +8,9 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import ParamsError, RecordError
-from pipeline.plants.simulator import Array
-from pipeline.records.record import Record
+from loopwright.pipeline.errors import ParamsError, RecordError
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
 
 HELD = 1e-9  # of an MV's span: what still counts as the same value
 NEAR = 0.1  # of the record's rows: how far the cut may move to come between two runs

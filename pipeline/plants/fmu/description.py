@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import PlantError
+from loopwright.pipeline.errors import PlantError
 
 REAL = {"Real", "Float64"}
 INSTALL = "pip install 'loopwright[fmu]'"

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import final
 
-from pipeline.errors import PlantError
-from pipeline.plants.fmu.description import Description, fmpy
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.fmu.description import Description, fmpy
 
 try:
     import fcntl

@@ -12,9 +12,9 @@ from typing import Any, final
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.plants.fmu.description import Description, fmpy
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.fmu.description import Description, fmpy
+from loopwright.pipeline.plants.simulator import Array
 
 # What fmpy calls the same thing in FMI 2.0 and 3.0.
 NAMES: dict[int, dict[str, str]] = {

@@ -10,10 +10,10 @@ from typing import Protocol, final
 
 import numpy as np
 
-from pipeline.errors import PlantError
-from pipeline.plants.fmu.description import Description
-from pipeline.plants.fmu.instance import Instance, State
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.fmu.description import Description
+from loopwright.pipeline.plants.fmu.instance import Instance, State
+from loopwright.pipeline.plants.simulator import Array
 
 LARGEST = 1 << 16  # bytes of a state that every row of a simulation holds a copy of
 SPARE = 16  # words, and an eighth of the state: some states grow with what they remember

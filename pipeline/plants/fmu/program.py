@@ -8,14 +8,14 @@ from typing import final
 
 import numpy as np
 
-from pipeline.errors import PlantError, nearest
-from pipeline.plants.fmu.description import Description, Variable, described
-from pipeline.plants.fmu.folder import Folder
-from pipeline.plants.fmu.instance import Instance
-from pipeline.plants.fmu.memory import memory_of
-from pipeline.plants.fmu.table import FmuTable
-from pipeline.plants.program import Interface
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.errors import PlantError, nearest
+from loopwright.pipeline.plants.fmu.description import Description, Variable, described
+from loopwright.pipeline.plants.fmu.folder import Folder
+from loopwright.pipeline.plants.fmu.instance import Instance
+from loopwright.pipeline.plants.fmu.memory import memory_of
+from loopwright.pipeline.plants.fmu.table import FmuTable
+from loopwright.pipeline.plants.program import Interface
+from loopwright.pipeline.plants.simulator import Array
 
 PERIODS = 1  # numbers of a state between the PVs and the FMU's own: the periods since the start
 

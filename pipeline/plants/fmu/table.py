@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import PlantError
-from pipeline.files import read_json, write_json
-from serving.errors import LoopwrightError
-from serving.manifest import Signal
+from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.files import read_json, write_json
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.manifest import Signal
 
 ROLES = ("pv", "mv", "dv")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.output_error import fit_starts
-from pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from pipeline.plants.signals import Signals
-from pipeline.plants.simulator import Array
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.output_error import fit_starts
+from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Array
 
 
 def of_model(model: Identified) -> tuple[Dynamics, IdentifiedArrays]:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record
-from serving.manifest import Signal
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
 
 def signals_of(n_y: int, n_mv: int, n_dv: int = 0) -> Signals:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.models.identified.coupling import MOST_OPEN, sign_margin, unused_answers
-from pipeline.models.identified.proof import Answer
-from pipeline.models.identified.structure import Structure
+from loopwright.pipeline.models.identified.coupling import MOST_OPEN, sign_margin, unused_answers
+from loopwright.pipeline.models.identified.proof import Answer
+from loopwright.pipeline.models.identified.structure import Structure
 
 CERTAIN = Answer(1.0, 0.9, 1.1, 1, 9, 1.0, 0.05)
 GAINS = np.array([[1.0, 0.3, -0.1], [-0.3, 0.8, 0.2], [0.4, -0.2, 1.0]])

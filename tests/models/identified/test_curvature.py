@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.models.identified.candidates import misses
-from pipeline.models.identified.curvature import curved
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.selection import WHITE
+from loopwright.pipeline.models.identified.candidates import misses
+from loopwright.pipeline.models.identified.curvature import curved
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.selection import WHITE
 
 FIRST = Dynamics.linear(np.array([[0.8]]), np.array([[0.5]]))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.models.identified.doubt import MOST_COLOUR, colour_of, doubt_of
-from pipeline.plants.noise import coloured
+from loopwright.pipeline.models.identified.doubt import MOST_COLOUR, colour_of, doubt_of
+from loopwright.pipeline.plants.noise import coloured
 
 
 def answer(gain: float, pole: float, dead: int, length: int = 200) -> np.ndarray:

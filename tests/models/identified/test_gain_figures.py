@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from made_plants import second_order, signals_of
 
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.identified.verdict import gain_figures
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.identified.verdict import gain_figures
 
 
 def lag(pole: float, gain: float) -> Dynamics:

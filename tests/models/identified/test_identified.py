@@ -10,8 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.identified import Identified
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.identified import Identified
 
 
 def drawn(n_y: int = 2, n_mv: int = 1, n_dv: int = 1, n_x: int = 4, n_hidden: int = 3, seed: int = 0) -> Identified:

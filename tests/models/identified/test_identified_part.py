@@ -12,13 +12,13 @@ import pytest
 import torch
 from finished import free_run, plant_of
 
-from pipeline.config.params import parse
-from pipeline.errors import ModelError, ParamsError
-from pipeline.models import MODELS, load_model
-from pipeline.models.identified.identified import Identified
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.part import Learnt, Source
-from pipeline.simulation.rests import local_gains
+from loopwright.pipeline.config.params import parse
+from loopwright.pipeline.errors import ModelError, ParamsError
+from loopwright.pipeline.models import MODELS, load_model
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.part import Learnt, Source
+from loopwright.pipeline.simulation.rests import local_gains
 
 LINEAR = IdentifiedPart(orders=(2, 3), units=(), minutes=0.02)
 SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.05)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from test_output_error import contracting
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.innovations import (
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.innovations import (
     Innovations,
     PredictionError,
     begun,
@@ -22,8 +22,8 @@ from pipeline.models.identified.innovations import (
     typical,
     with_loads,
 )
-from pipeline.models.identified.output_error import OutputError, residuals
-from pipeline.models.identified.sensitivities import sensitivity_sums
+from loopwright.pipeline.models.identified.output_error import OutputError, residuals
+from loopwright.pipeline.models.identified.sensitivities import sensitivity_sums
 
 Array = np.ndarray
 

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 from closed_loop_records import LOOPS, SIGNALS, OperatedLoop
 
-from pipeline.config.known import stated
-from pipeline.evaluation.known import known_rows
-from pipeline.evaluation.proof import sign_doubts, statements
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.identified.knowledge import Knowledge, Pair
-from pipeline.models.identified.linear_search import smallest_first
-from pipeline.models.identified.output_error import Fitted
-from pipeline.models.identified.scaled_record import ScaledRecord
-from pipeline.models.identified.structure import Structure
-from pipeline.models.identified.trial import Trial, best_of
-from pipeline.models.part import Source
-from pipeline.plants.signals import Signals
-from pipeline.records.record import Record
+from loopwright.pipeline.config.known import stated
+from loopwright.pipeline.evaluation.known import known_rows
+from loopwright.pipeline.evaluation.proof import sign_doubts, statements
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.identified.knowledge import Knowledge, Pair
+from loopwright.pipeline.models.identified.linear_search import smallest_first
+from loopwright.pipeline.models.identified.output_error import Fitted
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.models.identified.structure import Structure
+from loopwright.pipeline.models.identified.trial import Trial, best_of
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
 
 QUICK = IdentifiedPart(minutes=0.2, orders=(2, 4), units=())
 UNCERTAIN = OperatedLoop(gain=2.0, dead=3, kc=0.5, ti=10.0, hold=200, sp=4.0)

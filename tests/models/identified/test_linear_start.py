@@ -8,10 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.linear_start import Realizations, dead_times, high_order_arx, within_unit_circle
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.linear_start import (
+    Realizations,
+    dead_times,
+    high_order_arx,
+    within_unit_circle,
+)
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 
 
 def response_of(model: Dynamics, n_y: int, length: int) -> np.ndarray:

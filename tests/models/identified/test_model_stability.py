@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.rests import rest_map
-from pipeline.models.identified.stability import stability_figures
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.rests import rest_map
+from loopwright.pipeline.models.identified.stability import stability_figures
 
 
 def figures(model: Dynamics, rows: int = 400) -> dict[str, object]:

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from closed_loop_records import LOOPS, SIGNALS
 
-from pipeline.models.identified.candidates import Task, on_all_rows
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.identified.innovations import innovations
-from pipeline.models.identified.knowledge import Knowledge, Pair
-from pipeline.models.identified.linear_search import LinearSearch
-from pipeline.models.identified.noise_search import NoiseSearch
-from pipeline.models.identified.output_error import Fitted
-from pipeline.models.identified.rounds import Rounds
-from pipeline.models.identified.scaled_record import Fold
-from pipeline.models.identified.structure import Budget, Problem, Structure
-from pipeline.models.identified.trial import Trial
-from pipeline.models.part import Learnt, Source
+from loopwright.pipeline.models.identified.candidates import Task, on_all_rows
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.identified.innovations import innovations
+from loopwright.pipeline.models.identified.knowledge import Knowledge, Pair
+from loopwright.pipeline.models.identified.linear_search import LinearSearch
+from loopwright.pipeline.models.identified.noise_search import NoiseSearch
+from loopwright.pipeline.models.identified.output_error import Fitted
+from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.scaled_record import Fold
+from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure
+from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.part import Learnt, Source
 
 QUICK = IdentifiedPart(units=(), orders=(2, 3))
 MOVED = "calm, many set points"

@@ -11,16 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg
 
-from pipeline.models.identified import dynamics, sensitivities
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.output_error import (
+from loopwright.pipeline.models.identified import dynamics, sensitivities
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.output_error import (
     OutputError,
     fit_starts,
     free_run_error,
     residuals,
     squares,
 )
-from pipeline.models.identified.sensitivities import CHUNK, Equations, sensitivity_sums
+from loopwright.pipeline.models.identified.sensitivities import CHUNK, Equations, sensitivity_sums
 
 
 def drawn(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from closed_loop_records import OperatedLoop
 
-from pipeline.models.identified.proof import Answer, Region, answers, proof_figures
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.identified.structure import Structure
+from loopwright.pipeline.models.identified.proof import Answer, Region, answers, proof_figures
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.identified.structure import Structure
 
 MOVED = OperatedLoop(gain=-2.0, dead=3, kc=0.5, ti=10.0, hold=100)
 AT_REST = OperatedLoop(gain=-2.0, dead=3, kc=0.5, ti=10.0)

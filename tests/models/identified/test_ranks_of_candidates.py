@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.models.identified.candidates import wild
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.linear_search import smallest_first
-from pipeline.models.identified.linear_start import dead_times
-from pipeline.models.identified.network_search import _offers
-from pipeline.models.identified.noise_search import NoiseSearch
-from pipeline.models.identified.output_error import Fitted
-from pipeline.models.identified.rounds import Rounds
-from pipeline.models.identified.scaled_record import Fold
-from pipeline.models.identified.selection import _as_its_linear_model, _settling_first, by_innovations
-from pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure
-from pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.identified.candidates import wild
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.linear_search import smallest_first
+from loopwright.pipeline.models.identified.linear_start import dead_times
+from loopwright.pipeline.models.identified.network_search import _offers
+from loopwright.pipeline.models.identified.noise_search import NoiseSearch
+from loopwright.pipeline.models.identified.output_error import Fitted
+from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.scaled_record import Fold
+from loopwright.pipeline.models.identified.selection import _as_its_linear_model, _settling_first, by_innovations
+from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure
+from loopwright.pipeline.models.identified.trial import Trial
 
 STRUCTURE = Structure("balanced", 1, (0, 0), (0,))
 

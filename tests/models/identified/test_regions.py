@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from closed_loop_records import OperatedLoop
 
-from pipeline.evaluation.proof import sign_doubts, statements
-from pipeline.models.identified.dynamics import Dynamics
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.identified.regions import Cells, alike, pieces
-from pipeline.models.identified.scaled_record import ScaledRecord
-from pipeline.models.part import Source
-from pipeline.records.record import Record
+from loopwright.pipeline.evaluation.proof import sign_doubts, statements
+from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.identified.regions import Cells, alike, pieces
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.records.record import Record
 
 PART = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.05)
 ROWS = 2_000

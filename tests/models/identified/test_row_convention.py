@@ -5,11 +5,11 @@ from __future__ import annotations
 import made_plants
 import numpy as np
 
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.identified.row_convention import may_act_in_its_row
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from pipeline.models.part import Source
-from pipeline.records.record import Record
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.identified.row_convention import may_act_in_its_row
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.records.record import Record
 
 FAST = 0.6  # share of the way to rest that the output goes in a period
 

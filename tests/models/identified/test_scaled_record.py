@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.errors import ModelError
-from pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds
 
 
 def test_outputs_have_deviation_one_and_mvs_their_range() -> None:

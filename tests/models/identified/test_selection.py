@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from pipeline.models.identified.selection import Selection
+from loopwright.pipeline.models.identified.selection import Selection
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ import made_plants
 import numpy as np
 import pytest
 
-from pipeline.models.identified.identified_part import IdentifiedPart
-from pipeline.models.identified.linear_search import LinearSearch
-from pipeline.models.identified.rounds import Rounds
-from pipeline.models.identified.structure import Budget, Structure
-from pipeline.models.identified.structure_search import Searched
-from pipeline.models.identified.trial import Trial
-from pipeline.models.part import Source
-from pipeline.records.record import Record
+from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
+from loopwright.pipeline.models.identified.linear_search import LinearSearch
+from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.structure import Budget, Structure
+from loopwright.pipeline.models.identified.structure_search import Searched
+from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.records.record import Record
 
 PART = IdentifiedPart(orders=(2, 2), units=(3,), minutes=0.01)
 

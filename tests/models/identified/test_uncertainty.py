@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.models.identified.dynamics import Dynamics, Stretch
-from pipeline.models.identified.output_error import OutputError, fit_starts
-from pipeline.models.identified.uncertainty import drawn
+from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.output_error import OutputError, fit_starts
+from loopwright.pipeline.models.identified.uncertainty import drawn
 
 TRUE = Dynamics.linear(np.array([[0.9]]), np.array([[0.2]]))
 ROWS = 3000
