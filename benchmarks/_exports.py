@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.cleaning.tags import Tag
 
 Array = NDArray[np.float64]
 PERIOD_S = 6.0

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 import numpy as np
 from _exports import HEADER, NOISE, PERIOD_S, ROWS, TAGS, Array, Export, cells, experiment, export_of
 
-from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.cleaning.tags import Tag
 
 CLEAN = experiment(0)
 RANDOM = np.random.default_rng(11)

@@ -21,9 +21,9 @@ from _exports import CLEAN, PERIOD_S, TAGS, Export, experiment
 from _spoilt_exports import KINDS, Kind
 
 from loopwright.pipeline.errors import ModelError, PipelineError
-from loopwright.pipeline.historian.reading import read_export
+from loopwright.pipeline.historian.cleaning.tags import named
+from loopwright.pipeline.historian.files.file_reader import read_export
 from loopwright.pipeline.historian.screening import Screened, screened
-from loopwright.pipeline.historian.tags import named
 from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
 from loopwright.pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales

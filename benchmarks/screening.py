@@ -29,7 +29,7 @@ from scipy.signal import lfilter
 
 from loopwright.pipeline.__main__ import main as loopwright
 from loopwright.pipeline.commands import new
-from loopwright.pipeline.historian import exported, screening
+from loopwright.pipeline.historian import export_params, screening
 
 BLOCK = 250_000  # rows that are made at a time: this process must stay smaller than the one that is measured
 WANTED_ROWS, WANTED_S, WANTED_MB = 5_000_000, 60.0, 1500.0
@@ -40,7 +40,7 @@ LOADS = np.array([0.05, -0.04, 0.03, 0.06])  # of the PVs, from the disturbance
 LAGS_S = np.array([40.0, 60.0, 90.0, 30.0])
 DEAD_S, NOISE = 5, 0.1
 PHASES: tuple[tuple[str, Any, str], ...] = (
-    ("reading", exported, "read_export"),
+    ("reading", export_params, "read_export"),
     ("screening of readings", screening, "clean"),
     ("remarks on readings", screening, "of_series"),
     ("settling", screening, "pace_of"),

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from loopwright.pipeline.historian.reading import read_export
+from loopwright.pipeline.historian.cleaning.tags import Tag, named
+from loopwright.pipeline.historian.files.file_reader import read_export
 from loopwright.pipeline.historian.screening import Screened, screened
-from loopwright.pipeline.historian.tags import Tag, named
 
 PERIOD_S = 6.0
 START_S = 1_709_532_000.0  # 2024-03-04 06:00 UTC

@@ -25,10 +25,10 @@ from torch import Tensor
 from loopwright.pipeline.commands import new
 from loopwright.pipeline.commands.new_exported import asked, given_tags
 from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
-from loopwright.pipeline.historian.exported import screened_export, with_units
+from loopwright.pipeline.historian.cleaning.tags import named
+from loopwright.pipeline.historian.export_params import screened_export, with_units
 from loopwright.pipeline.historian.guessing import controlled_first
-from loopwright.pipeline.historian.refusal import refusal
-from loopwright.pipeline.historian.tags import named
+from loopwright.pipeline.historian.screening import refusal
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.plants.identified import IdentifiedPlant, longest_memory
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Array, Simulator

@@ -27,14 +27,13 @@ from loopwright.pipeline.config.params import sections
 from loopwright.pipeline.config.plants import check_name
 from loopwright.pipeline.errors import PipelineError, RecordError
 from loopwright.pipeline.files import draft_folder_of, write_json, write_text
-from loopwright.pipeline.historian.excerpt import evenly
-from loopwright.pipeline.historian.exported import screened_export, with_units
+from loopwright.pipeline.historian.answers import beside_record
+from loopwright.pipeline.historian.cleaning.record_rows import evenly
+from loopwright.pipeline.historian.cleaning.tags import RANGES, ROLES, TableError, Tag, limited, named
+from loopwright.pipeline.historian.export_params import screened_export, with_units
 from loopwright.pipeline.historian.guessing import controlled_first
-from loopwright.pipeline.historian.known_record import beside_record
-from loopwright.pipeline.historian.refusal import Refusal, refusal
-from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.historian.screening import Refusal, Screened, refusal
 from loopwright.pipeline.historian.step_test import planned
-from loopwright.pipeline.historian.tags import RANGES, ROLES, TableError, Tag, limited, named
 from loopwright.pipeline.plants.simulator_file import FileSimulator, is_fmu
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.report.screening import write_page

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 from loopwright.pipeline.config.plants import mistakes_of_mv
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.findings import InputReport
-from loopwright.pipeline.historian.tags import Tag, commanded_range
+from loopwright.pipeline.historian.cleaning.findings import InputReport
+from loopwright.pipeline.historian.cleaning.tags import Tag, commanded_range
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.serving.manifest import Signal
 

@@ -12,11 +12,8 @@ from loopwright.pipeline.commands.new_widened import Widening
 from loopwright.pipeline.config.exports import ExportParams
 from loopwright.pipeline.config.intervals import Interval
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.exported import exported
-from loopwright.pipeline.historian.findings import counted
-from loopwright.pipeline.historian.guessing import guesses, loops_in
-from loopwright.pipeline.historian.reading import read_export, tags_in, units_of
-from loopwright.pipeline.historian.tags import (
+from loopwright.pipeline.historian.cleaning.findings import counted
+from loopwright.pipeline.historian.cleaning.tags import (
     EXPLAINED,
     ROLES,
     Tag,
@@ -27,6 +24,9 @@ from loopwright.pipeline.historian.tags import (
     read_tags,
     write_tags,
 )
+from loopwright.pipeline.historian.export_params import exported
+from loopwright.pipeline.historian.files.file_reader import read_export, tags_in, units_of
+from loopwright.pipeline.historian.guessing import guesses, loops_in
 from loopwright.serving.words import plain
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.tags import SIGNAL_ROLES, Guess, Tag, named, write_tags
+from loopwright.pipeline.historian.cleaning.tags import SIGNAL_ROLES, Guess, Tag, named, write_tags
 from loopwright.pipeline.plants.fmu.description import Description, Variable, described
 from loopwright.pipeline.plants.fmu.program import variable_of
 from loopwright.pipeline.plants.fmu.table import FmuRow, FmuTable

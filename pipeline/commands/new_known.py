@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from loopwright.pipeline.config.known import FORMS, Known, stated, together
 from loopwright.pipeline.config.plants import mistake_of_known
 from loopwright.pipeline.errors import RecordError, nearest
-from loopwright.pipeline.historian.tags import TableError, Tag
+from loopwright.pipeline.historian.cleaning.tags import TableError, Tag
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
 

@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.historian.cleaning.findings import InputReport, Screening, Verdict, counted
 from loopwright.pipeline.historian.excitation import HELD
-from loopwright.pipeline.historian.findings import InputReport, Screening, Verdict, counted
-from loopwright.pipeline.historian.pace import in_words
+from loopwright.pipeline.historian.settling import in_words
 from loopwright.pipeline.historian.step_test import StepTest
 from loopwright.pipeline.pictures.drawing import axis_label, ratio_unit
 from loopwright.serving.words import plain

@@ -16,7 +16,7 @@ from loopwright.pipeline.config.known import Known, together
 from loopwright.pipeline.config.params import read_section, sections
 from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.tags import COMMANDS, Tag
+from loopwright.pipeline.historian.cleaning.tags import COMMANDS, Tag
 from loopwright.pipeline.records.old_controller import OldController
 
 REFUSED = {"screening.json", "screening.html", "step_test.csv"}  # all that is left of an export that was not added

@@ -10,7 +10,7 @@ from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.excitation.first_test import FirstTest, first_test
 from loopwright.pipeline.excitation.planned import Plan, excited, planned
 from loopwright.pipeline.files import sha256, write_json
-from loopwright.pipeline.historian.findings import Finding
+from loopwright.pipeline.historian.cleaning.findings import Finding
 from loopwright.pipeline.historian.made import judged_record
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.plants.fmu.table import FmuTable

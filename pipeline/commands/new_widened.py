@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, field, replace
 
+from loopwright.pipeline.historian.cleaning.tags import Tag
+from loopwright.pipeline.historian.files.file_reader import read_export
 from loopwright.pipeline.historian.guessing import seen_range
-from loopwright.pipeline.historian.reading import read_export
-from loopwright.pipeline.historian.tags import Tag
 
 
 @dataclass(slots=True)

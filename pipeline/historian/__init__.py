@@ -1,5 +1,5 @@
 """Exports of plant historians: read, screened, put on one grid of time, and judged as data for a model.
 
-Files -> ``reading`` -> a series a tag -> ``cells`` -> ``resampling`` -> ``stretches`` -> ``screening`` -> Record.
-``excitation`` says whether the record can carry a model, ``step_test`` what to do where it cannot.
+``files`` reads a series a tag, ``cleaning`` checks readings and puts them on rows, ``screening`` makes the Record and
+its account. ``excitation`` says whether the record can carry a model, ``step_test`` what to do where it cannot.
 """

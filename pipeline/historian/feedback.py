@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.historian.direct import DirectModel
+from loopwright.pipeline.historian.answers import DirectModel
 from loopwright.pipeline.metrics import Array
 
 Runs = NDArray[np.int64]

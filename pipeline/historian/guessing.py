@@ -10,18 +10,18 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.historian.cells import slips_of, usual
-from loopwright.pipeline.historian.character import smallest_difference
+from loopwright.pipeline.historian.answers import first_answer
+from loopwright.pipeline.historian.arx_model import fitted
+from loopwright.pipeline.historian.cleaning.grid import resampled
+from loopwright.pipeline.historian.cleaning.outliers_and_units import slips_of, usual
+from loopwright.pipeline.historian.cleaning.sampling import proposed_period
+from loopwright.pipeline.historian.cleaning.tag_checks import sentinels
+from loopwright.pipeline.historian.cleaning.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag, automatic, by_hand
 from loopwright.pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, moves_of
-from loopwright.pipeline.historian.export import Export, Series
 from loopwright.pipeline.historian.feedback import follows
-from loopwright.pipeline.historian.first_answer import first_answer
-from loopwright.pipeline.historian.grid import resampled
-from loopwright.pipeline.historian.linear import fitted
-from loopwright.pipeline.historian.missing_codes import sentinels
-from loopwright.pipeline.historian.reason import Reason
-from loopwright.pipeline.historian.sampling import proposed_period
-from loopwright.pipeline.historian.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag, automatic, by_hand
+from loopwright.pipeline.historian.files.export import Export, Series
+from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.signal_statistics import smallest_difference
 from loopwright.pipeline.metrics import Array
 
 ENDINGS: tuple[tuple[str, str], ...] = (

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from loopwright.pipeline.historian.excerpt import evenly
+from loopwright.pipeline.historian.cleaning.findings import Finding, Screening, TagReport
+from loopwright.pipeline.historian.cleaning.grid import Grid
+from loopwright.pipeline.historian.cleaning.record_rows import evenly
+from loopwright.pipeline.historian.cleaning.sampling import Sampling
 from loopwright.pipeline.historian.excitation import judged
-from loopwright.pipeline.historian.export import Series
-from loopwright.pipeline.historian.findings import Finding, Screening, TagReport
-from loopwright.pipeline.historian.grid import Grid
-from loopwright.pipeline.historian.sampling import Sampling
+from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.screening import Screened, models_of
 from loopwright.pipeline.records.record import Record
 

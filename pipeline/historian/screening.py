@@ -11,39 +11,76 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.cells import usual
-from loopwright.pipeline.historian.character import quantum
-from loopwright.pipeline.historian.confirming import confirm
-from loopwright.pipeline.historian.contradictions import contradict
-from loopwright.pipeline.historian.copies import drop_copies
-from loopwright.pipeline.historian.excerpt import SEEN, evenly
-from loopwright.pipeline.historian.excitation import judged, moves_of, with_rows_out_of_range
-from loopwright.pipeline.historian.export import Export, Series
-from loopwright.pipeline.historian.few_levels import with_levels
-from loopwright.pipeline.historian.findings import Finding, Screening, TagReport
-from loopwright.pipeline.historian.free_run import believed
-from loopwright.pipeline.historian.grid import Grid, resampled
-from loopwright.pipeline.historian.left_out import flag_readings, flag_rows, interval_text, of_left_out, spans_of
-from loopwright.pipeline.historian.linear import Linear
-from loopwright.pipeline.historian.loads import with_load_moves
-from loopwright.pipeline.historian.modes import check_modes
-from loopwright.pipeline.historian.old_controller import old_controllers
-from loopwright.pipeline.historian.operated import operated
-from loopwright.pipeline.historian.pace import of_period, pace_of
-from loopwright.pipeline.historian.pulses import pulses
-from loopwright.pipeline.historian.readings import clean, reasons_of, with_texts_of_one_side
-from loopwright.pipeline.historian.reason import Reason
-from loopwright.pipeline.historian.remarks import of_files, of_grid, of_mode, of_models, of_notes, of_rows, of_series
-from loopwright.pipeline.historian.rows import record_of, row_codes, stretches
-from loopwright.pipeline.historian.sampling import Sampling, proposed_period, sampling
-from loopwright.pipeline.historian.standstill import stops
-from loopwright.pipeline.historian.static import explained
-from loopwright.pipeline.historian.stopped import of_zeros
-from loopwright.pipeline.historian.tags import Tag
-from loopwright.pipeline.historian.unmoved import of_answers
-from loopwright.pipeline.historian.wandering import of_levels, of_quick_models
+from loopwright.pipeline.historian.arx_model import Linear, believed
+from loopwright.pipeline.historian.cleaning.findings import Finding, Screening, TagReport, Verdict, counted
+from loopwright.pipeline.historian.cleaning.grid import Grid, resampled
+from loopwright.pipeline.historian.cleaning.outliers_and_units import usual
+from loopwright.pipeline.historian.cleaning.record_rows import (
+    WINDOWED,
+    check_modes,
+    evenly,
+    flag_readings,
+    flag_rows,
+    interval_text,
+    of_left_out,
+    record_of,
+    row_codes,
+    spans_of,
+    stretches,
+)
+from loopwright.pipeline.historian.cleaning.repeated_blocks import drop_copies
+from loopwright.pipeline.historian.cleaning.response_consistency import contradict
+from loopwright.pipeline.historian.cleaning.sampling import Sampling, proposed_period, sampling
+from loopwright.pipeline.historian.cleaning.tag_checks import clean, reasons_of, with_texts_of_one_side
+from loopwright.pipeline.historian.cleaning.tags import Tag, commanded_range
+from loopwright.pipeline.historian.drift import explained, of_levels, of_quick_models
+from loopwright.pipeline.historian.excitation import SEEN, judged, moves_of, with_rows_out_of_range
+from loopwright.pipeline.historian.files.export import Export, Series
+from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.signal_statistics import quantum
+from loopwright.pipeline.historian.notices import (
+    of_files,
+    of_grid,
+    of_mode,
+    of_models,
+    of_notes,
+    of_rows,
+    of_series,
+    on_off,
+    with_levels,
+)
+from loopwright.pipeline.historian.old_loops import old_controllers, operated
+from loopwright.pipeline.historian.outlier_review import confirm, pulses
+from loopwright.pipeline.historian.settling import of_period, pace_of
+from loopwright.pipeline.historian.standstill import of_zeros, stops
+from loopwright.pipeline.historian.step_test import with_load_moves
+from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record
+from loopwright.serving.manifest import Signal
 
+
+# ---------------------------------------------------------------------------------- process variables that no MV moves
+def of_answers(pvs: Sequence[str], verdict: Verdict) -> list[Finding]:
+    """One finding for each PV that answers to no MV, and one where not every PV can be controlled.
+
+    Empty where no PV answers at all: then the verdict says what is wrong with the MVs. ``pvs`` are names, in order.
+    """
+    mvs = [i for i in verdict.inputs if i.role == "mv"]
+    unmoved = [n for n in pvs if not any(i.answers.get(n, 0.0) > SEEN or n in i.first_answer_s for i in mvs)]
+    found = []
+    if len(unmoved) < len(pvs):
+        found += [Finding("unmoved", n, "answers to no MV: leave its role empty, or make it dv") for n in unmoved]
+    if len(pvs) > len(mvs):
+        first, others = ", ".join(pvs[: len(mvs)]), ", ".join(pvs[len(mvs) :])
+        words = (
+            f"will be controlled, the first of {counted(len(pvs), 'PV')} for {counted(len(mvs), 'MV')}; {others} will "
+            "not: to change it, put the PVs to control first"
+        )
+        found.append(Finding("controlled", first, words))
+    return found
+
+
+# ------------------------------------------------------------------------------------------------- the whole screening
 LARGE = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures
 
 
@@ -136,7 +173,7 @@ def screened(
     excerpt = evenly(record)
     models = models_of(excerpt)
     moved = max(
-        (len(moves_of(grid.value[t.tag][code == 0][:SEEN], record.run[:SEEN])) for t in tags if t.role == "sp"),
+        (len(moves_of(grid.value[t.tag][code == 0][:WINDOWED], record.run[:WINDOWED])) for t in tags if t.role == "sp"),
         default=0,
     )
     findings = of_quick_models(findings, excerpt, models, {t.name: t.tag for t in signals})
@@ -253,3 +290,46 @@ def _tag_report(
 def _mode_rows(grid: Grid, series: Series) -> dict[str, int]:
     values = grid.value[series.tag]
     return {name: int(np.count_nonzero(values == i)) for i, name in enumerate(series.categories)}
+
+
+# ----------------------------------------------------------------------------------- why a screened record is not used
+LEAST_SHARED = 0.05  # of the commanded or the visited range, the smaller one: what both must share
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Faults of a record, and the remedies."""
+
+    why: str
+    step_test: bool = False  # a step test gives a better one
+    anyway: bool = False  # a person may use it all the same
+
+
+def refusal(found: Screened, tags: Sequence[Tag], anyway: bool) -> Refusal | None:
+    """Why the record is not used; None where it is."""
+    record, verdict = found.record, found.report.verdict
+    for signal, values in zip(record.mv_signals, record.mv.T, strict=True):
+        if float(values.max() - values.min()) <= 1e-9 * (signal.high - signal.low):
+            return Refusal(f"{signal.name} is {values[0]:g} {signal.unit} in every row", step_test=True)
+        if words := unvisited(signal, values, tags):
+            return Refusal(words)
+    if (switched := on_off(record, tags)) and not anyway:
+        return Refusal(switched[0], anyway=True)
+    if verdict.rows < verdict.parameters:
+        return Refusal(f"{verdict.reasons[0]}; with fewer rows than parameters --anyway does not help")
+    if verdict.carries == "no" and not anyway:
+        return Refusal(verdict.reasons[0], step_test=True, anyway=True)
+    return None
+
+
+def unvisited(signal: Signal, values: Array, tags: Sequence[Tag]) -> str:
+    """Why an MV cannot be commanded as wished: its record (n,) hardly went there; empty where it can."""
+    low, high = commanded_range(signal, tags)
+    least, most = float(values.min()), float(values.max())
+    if min(most, high) - max(least, low) >= LEAST_SHARED * min(most - least, high - low):
+        return ""
+    return (
+        f"{signal.name} may be commanded from {low:g} to {high:g} {signal.unit}, but moved only from {least:g} to "
+        f"{most:g} in the record, so nothing is known of the plant there; widen command_low or command_high, or add a "
+        "record of that range"
+    )

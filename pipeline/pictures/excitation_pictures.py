@@ -7,18 +7,18 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from loopwright.pipeline.historian.excerpt import evenly
+from loopwright.pipeline.historian.cleaning.findings import InputReport, Verdict
+from loopwright.pipeline.historian.cleaning.record_rows import evenly
 from loopwright.pipeline.historian.excitation import (
     ALIKE,
     ENOUGH_MOVES,
     FOLLOWS,
     ROWS_A_PARAMETER,
+    Spectrum,
     moves_of,
     spectra_of,
 )
-from loopwright.pipeline.historian.findings import InputReport, Verdict
 from loopwright.pipeline.historian.screening import Screened
-from loopwright.pipeline.historian.spectra import Spectrum
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.pictures.drawing import SIZE, STYLE
 

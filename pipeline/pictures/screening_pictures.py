@@ -12,9 +12,9 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from loopwright.pipeline.historian.character import runs_of
-from loopwright.pipeline.historian.findings import TagReport
-from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.cleaning.findings import TagReport
+from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.signal_statistics import runs_of
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.pictures.dates import ExportTimes

@@ -9,8 +9,8 @@ import numpy as np
 
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.files import read_json
-from loopwright.pipeline.historian.cells import usual
-from loopwright.pipeline.historian.wandering import Levels, levels_of
+from loopwright.pipeline.historian.cleaning.outliers_and_units import usual
+from loopwright.pipeline.historian.drift import Levels, levels_of
 
 SCREENING = "screening.json"  # beside the record
 GONE = "the model explains the rest, no drift is left, and there is nothing to do"

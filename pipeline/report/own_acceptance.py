@@ -12,7 +12,7 @@ from loopwright.pipeline.evaluation.metric import NO_UNIT
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
 from loopwright.pipeline.evaluation.proof import statements
 from loopwright.pipeline.evaluation.validation import Statement
-from loopwright.pipeline.historian.pace import in_words
+from loopwright.pipeline.historian.settling import in_words
 from loopwright.pipeline.historian.step_test import ALONE, HOLDS, LARGEST, MOVES
 from loopwright.pipeline.pictures.drawing import axis_label
 from loopwright.pipeline.pictures.numbers import number, times

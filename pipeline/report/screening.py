@@ -8,7 +8,7 @@ from pathlib import Path
 from matplotlib.figure import Figure as Canvas
 
 from loopwright.pipeline.files import write_text
-from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.files.rejection_codes import Reason
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.historian.step_test import StepTest
 from loopwright.pipeline.pictures.excitation_pictures import inputs, verdict

@@ -28,9 +28,8 @@ from loopwright.pipeline.config.params import (
 from loopwright.pipeline.config.plants import PlantParams, own_plants
 from loopwright.pipeline.errors import ParamsError, PipelineError
 from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.historian.agreement import check_agreement, check_period
-from loopwright.pipeline.historian.exported import signal_tags
-from loopwright.pipeline.historian.tags import check_tags
+from loopwright.pipeline.historian.cleaning.tags import check_tags
+from loopwright.pipeline.historian.export_params import check_agreement, check_period, signal_tags
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.laws.fitting import require_fit
 from loopwright.pipeline.models.local.linearized import LinearizedPart

@@ -11,11 +11,19 @@ from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.files import write_json
-from loopwright.pipeline.historian.agreement import as_stated, check_agreement, check_period, limits_of, within_stated
-from loopwright.pipeline.historian.excerpt import evenly
-from loopwright.pipeline.historian.exported import screened_export, signal_tags, with_units
-from loopwright.pipeline.historian.loop_rows import set_points
-from loopwright.pipeline.historian.refusal import refusal
+from loopwright.pipeline.historian.cleaning.record_rows import evenly
+from loopwright.pipeline.historian.export_params import (
+    as_stated,
+    check_agreement,
+    check_period,
+    limits_of,
+    screened_export,
+    signal_tags,
+    with_units,
+    within_stated,
+)
+from loopwright.pipeline.historian.old_loops import set_points
+from loopwright.pipeline.historian.screening import refusal
 from loopwright.pipeline.report.screening import write_page
 
 

@@ -18,7 +18,7 @@ from loopwright.pipeline.commands.new_fmu import MISSING, proposals, table_from
 from loopwright.pipeline.commands.new_simulated import SLOW, WANTED, simulated
 from loopwright.pipeline.excitation.first_test import first_test
 from loopwright.pipeline.files import sha256
-from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.plants.fmu.description import described
 from loopwright.pipeline.plants.fmu.instance import Instance
 from loopwright.pipeline.plants.simulator_file import FileSimulator

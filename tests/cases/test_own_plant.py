@@ -15,7 +15,7 @@ from loopwright.pipeline.cases.loads import LOAD
 from loopwright.pipeline.cases.own_model import LEAST_GAIN, Doubts, OwnPlant
 from loopwright.pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
 from loopwright.pipeline.errors import ParamsError, PlantError
-from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.assembly import remembering
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.plants.signals import Signals

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from loopwright.pipeline.commands.new_commands import confirmed
-from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.serving.manifest import Signal
 
 SIGNALS = (Signal("OP", "%", 0.0, 100.0), Signal("damper", "%", 0.0, 90.0))

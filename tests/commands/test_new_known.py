@@ -15,10 +15,10 @@ from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.config.plants import PlantParams
-from loopwright.pipeline.historian.exported import exported, signal_tags
+from loopwright.pipeline.historian.cleaning.tags import Tag, read_tags
+from loopwright.pipeline.historian.export_params import exported, signal_tags
 from loopwright.pipeline.historian.guessing import controlled_first, loop_in
-from loopwright.pipeline.historian.loop_rows import _partner
-from loopwright.pipeline.historian.tags import Tag, read_tags
+from loopwright.pipeline.historian.old_loops import _partner
 from loopwright.pipeline.stages.fit import _source
 
 ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]"]

@@ -11,9 +11,9 @@ import pytest
 from dirty_plant import PERIOD_S, TAGS, Clean, cells, clean, screen, screen_of, write
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.cleaning.tags import Tag
+from loopwright.pipeline.historian.files.rejection_codes import Reason
 from loopwright.pipeline.historian.screening import Screened
-from loopwright.pipeline.historian.tags import Tag
 
 SEED = np.random.default_rng(5)
 SPOT = SEED.choice(np.arange(60, 1440), 20, replace=False)

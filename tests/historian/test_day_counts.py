@@ -11,7 +11,7 @@ import pytest
 from dirty_plant import write
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.reading import read_export
+from loopwright.pipeline.historian.files.file_reader import read_export
 
 START_S = 1_709_532_000.0  # 2024-03-04 06:00 UTC
 N = 40

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from closed_loop_records import OperatedLoop
 
-from loopwright.pipeline.historian.direct import DirectModel, blocks_to
+from loopwright.pipeline.historian.answers import DirectModel, blocks_to
 
 MOVED = {
     "positive": OperatedLoop(gain=2.0, dead=3, kc=0.5, ti=10.0, hold=100),

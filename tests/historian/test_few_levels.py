@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from dirty_plant import TAGS, clean, screen_of, spoilt
 
-from loopwright.pipeline.historian.few_levels import on_off
-from loopwright.pipeline.historian.refusal import refusal
-from loopwright.pipeline.historian.screening import Screened
-from loopwright.pipeline.historian.tags import Tag, named
+from loopwright.pipeline.historian.cleaning.tags import Tag, named
+from loopwright.pipeline.historian.notices import on_off
+from loopwright.pipeline.historian.screening import Screened, refusal
 from loopwright.pipeline.records.levels import levels_of, only_between
 
 PV, MV, DV = TAGS

@@ -9,8 +9,8 @@ import pytest
 from dirty_plant import PERIOD_S, Clean, clean, screen_of, steps
 
 from loopwright.pipeline.commands.new_printed import sayings
-from loopwright.pipeline.historian.findings import Verdict
-from loopwright.pipeline.historian.first_answer import first_answer
+from loopwright.pipeline.historian.answers import first_answer
+from loopwright.pipeline.historian.cleaning.findings import Verdict
 
 N, DEAD, FIRST = 4000, 3, 4  # u(k-3) acts on y(k+1)
 

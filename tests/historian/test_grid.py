@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian import grid as grid_module
-from loopwright.pipeline.historian.export import Series
-from loopwright.pipeline.historian.grid import resampled
-from loopwright.pipeline.historian.reason import Reason
-from loopwright.pipeline.historian.sampling import proposed_period, sampling
+from loopwright.pipeline.historian.cleaning import grid as grid_module
+from loopwright.pipeline.historian.cleaning.grid import resampled
+from loopwright.pipeline.historian.cleaning.sampling import proposed_period, sampling
+from loopwright.pipeline.historian.files.export import Series
+from loopwright.pipeline.historian.files.rejection_codes import Reason
 
 
 def series(tag: str, t: np.ndarray, v: np.ndarray) -> Series:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from loopwright.pipeline.historian.arx_model import fitted, lead
+from loopwright.pipeline.historian.files.file_reader import read_export, units_of
 from loopwright.pipeline.historian.guessing import guesses
-from loopwright.pipeline.historian.linear import fitted, lead
-from loopwright.pipeline.historian.reading import read_export, units_of
 
 N = 3000
 

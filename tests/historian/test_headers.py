@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from loopwright.pipeline.historian.headers import split_header
+from loopwright.pipeline.historian.files.headers import split_header
 
 
 @pytest.mark.parametrize(

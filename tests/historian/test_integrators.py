@@ -10,8 +10,8 @@ import pytest
 from dirty_plant import Clean, screen_of, steps
 
 from loopwright.pipeline.commands.new_printed import sayings
+from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.screening import Screened
-from loopwright.pipeline.historian.tags import Tag
 
 RATE = 0.02  # a row, of the level by the valve
 PERIOD_S = 10.0

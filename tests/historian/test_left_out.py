@@ -13,7 +13,7 @@ from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, cells, clean, sc
 from loopwright.pipeline.config.exports import ExportParams
 from loopwright.pipeline.config.intervals import Interval
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.files.rejection_codes import Reason
 from loopwright.pipeline.historian.screening import Screened
 
 DATES = "2024-03-04T06:10:00..2024-03-04T06:20:00"  # minutes 10 to 20 of the record

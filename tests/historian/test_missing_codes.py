@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from dirty_plant import TAGS, clean, screen_of, spoilt
 
-from loopwright.pipeline.historian.missing_codes import sentinels
+from loopwright.pipeline.historian.cleaning.tag_checks import sentinels
+from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.screening import Screened
-from loopwright.pipeline.historian.tags import Tag
 
 PV, MV, DV = TAGS
 RANGED = (replace(PV, low=0.0, high=120.0), replace(MV, low=0.0, high=100.0), DV)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from loopwright.pipeline.historian.tags import automatic, by_hand
+from loopwright.pipeline.historian.cleaning.tags import automatic, by_hand
 
 
 @pytest.mark.parametrize(

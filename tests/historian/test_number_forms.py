@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.dialect import sniff
-from loopwright.pipeline.historian.numbers import loose_number, numbers
-from loopwright.pipeline.historian.reading import read_export
+from loopwright.pipeline.historian.files.dialect import sniff
+from loopwright.pipeline.historian.files.file_reader import read_export
+from loopwright.pipeline.historian.files.numbers import loose_number, numbers
 
 MINUSES = ["-", "\u2212", "\u2013", "\u2010", "\u2011", "\ufe63", "\uff0d", "\u2212\u00a0", "- "]
 THOUSANDS = ["", "\u00a0", "\u202f", "\u2009", " ", "'", "’"]

@@ -15,10 +15,19 @@ from undrawn import draw_nothing
 
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.config.exports import ExportParams, screened_record
-from loopwright.pipeline.historian.excerpt import SEEN
-from loopwright.pipeline.historian.export import Series
-from loopwright.pipeline.historian.pace import FINE, MOST_PERIODS, Answer, Pace, _settling, in_words, of_period, pace_of
-from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.cleaning.record_rows import WINDOWED
+from loopwright.pipeline.historian.cleaning.tags import Tag
+from loopwright.pipeline.historian.files.export import Series
+from loopwright.pipeline.historian.settling import (
+    FINE,
+    MOST_PERIODS,
+    Answer,
+    Pace,
+    _settling,
+    in_words,
+    of_period,
+    pace_of,
+)
 from loopwright.pipeline.stages.screen import screen
 
 START_S = 1_709_532_000.0
@@ -167,7 +176,7 @@ def test_what_nobody_moves_has_no_pace() -> None:
 
 
 def test_a_long_export_is_looked_at_in_parts() -> None:
-    y, u = slow(0, 2 * SEEN, (600, 3000))
+    y, u = slow(0, 2 * WINDOWED, (600, 3000))
     found = pace([y + noise(0, len(y), 0.2)], [u])
     assert found.slowest is not None
     assert found.slowest.settles_s == pytest.approx(800, rel=0.2)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from dirty_plant import TAGS, cells, clean, write
 
-from loopwright.pipeline.historian.quality import meaning_of
-from loopwright.pipeline.historian.reading import read_export
-from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.files.file_reader import read_export
+from loopwright.pipeline.historian.files.quality import meaning_of
+from loopwright.pipeline.historian.files.rejection_codes import Reason
 
 N = 60
 NAMES = [t.tag for t in TAGS]

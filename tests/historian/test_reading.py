@@ -16,10 +16,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.dialect import sniff
-from loopwright.pipeline.historian.numbers import numbers
-from loopwright.pipeline.historian.reading import read_export, units_of
-from loopwright.pipeline.historian.reason import Reason
+from loopwright.pipeline.historian.files.dialect import sniff
+from loopwright.pipeline.historian.files.file_reader import read_export, units_of
+from loopwright.pipeline.historian.files.numbers import numbers
+from loopwright.pipeline.historian.files.rejection_codes import Reason
 
 N = 60
 DATA = clean(N)

@@ -10,10 +10,10 @@ import pytest
 from dirty_plant import TAGS, cells, clean, screen, screen_of, write
 
 from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.cleaning.tags import Tag, named, write_tags
+from loopwright.pipeline.historian.files.file_reader import read_export
 from loopwright.pipeline.historian.guessing import guesses
-from loopwright.pipeline.historian.reading import read_export
 from loopwright.pipeline.historian.screening import Screened, screened
-from loopwright.pipeline.historian.tags import Tag, named, write_tags
 
 HEADER = ("timestamp", *(t.tag for t in TAGS))
 MODES = (Tag("A.MODE", "mode"), Tag("B.MODE", "mode"))

@@ -10,13 +10,13 @@ import pytest
 from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, clean, screen_of, steps
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.export import Export, Series
-from loopwright.pipeline.historian.exported import exported, signal_tags
-from loopwright.pipeline.historian.grid import resampled
-from loopwright.pipeline.historian.reason import Reason
-from loopwright.pipeline.historian.sampling import sampling
+from loopwright.pipeline.historian.cleaning.grid import resampled
+from loopwright.pipeline.historian.cleaning.sampling import sampling
+from loopwright.pipeline.historian.cleaning.tags import Tag, named, read_tags
+from loopwright.pipeline.historian.export_params import exported, signal_tags
+from loopwright.pipeline.historian.files.export import Export, Series
+from loopwright.pipeline.historian.files.rejection_codes import Reason
 from loopwright.pipeline.historian.screening import Screened, screened
-from loopwright.pipeline.historian.tags import Tag, named, read_tags
 
 PV, MV, DV = TAGS
 LEVEL = Tag("TIC-101.PV", "pv", "m")

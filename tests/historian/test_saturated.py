@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from dirty_plant import TAGS, clean, screen_of, spoilt
 
-from loopwright.pipeline.historian.character import clipped
+from loopwright.pipeline.historian.files.signal_statistics import clipped
 from loopwright.pipeline.historian.screening import Screened
 
 PV, MV, DV = TAGS

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from dirty_plant import PERIOD_S, TAGS, cells, clean, write
 
-from loopwright.pipeline.historian.reading import read_export
+from loopwright.pipeline.historian.cleaning.tags import named
+from loopwright.pipeline.historian.files.file_reader import read_export
 from loopwright.pipeline.historian.screening import Screened, screened
-from loopwright.pipeline.historian.tags import named
 
 DATA = clean()
 N = len(DATA.pv)

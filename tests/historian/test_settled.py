@@ -12,13 +12,20 @@ from scipy.signal import lfilter
 
 from loopwright.pipeline.commands.new_printed import sayings
 from loopwright.pipeline.config.known import Known
-from loopwright.pipeline.historian import settled
-from loopwright.pipeline.historian.findings import Finding, InputReport
-from loopwright.pipeline.historian.loads import load_sd
+from loopwright.pipeline.historian import settling
+from loopwright.pipeline.historian.cleaning.findings import Finding, InputReport
+from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.screening import spelt
-from loopwright.pipeline.historian.settled import certain, step_answers
-from loopwright.pipeline.historian.step_test import GUESSED_H, LARGEST, LONGEST_H, MOST, UNKNOWN_PERIODS, planned
-from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.settling import certain, step_answers
+from loopwright.pipeline.historian.step_test import (
+    GUESSED_H,
+    LARGEST,
+    LONGEST_H,
+    MOST,
+    UNKNOWN_PERIODS,
+    load_sd,
+    planned,
+)
 
 LOAD_SD, LAG, DEAD = 4.0, 20, 7
 
@@ -81,7 +88,7 @@ def test_inputs_that_settle_alike_share_a_fit(monkeypatch: pytest.MonkeyPatch) -
     u, v = (np.repeat(random.uniform(-20, 20, n // 50), 50) for _ in range(2))
     y = lfilter([0, 0.1], [1, -0.9], u - 0.5 * v) + random.normal(0, 0.1, n)
     fits = []
-    monkeypatch.setattr(settled, "step_answers", lambda *given: fits.append(given) or step_answers(*given))
+    monkeypatch.setattr(settling, "step_answers", lambda *given: fits.append(given) or step_answers(*given))
     assert certain(y, [u, v], np.zeros(n, np.int64), {0: 23, 1: 24}) == {0, 1}
     assert len(fits) == 1
 

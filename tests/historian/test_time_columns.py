@@ -11,10 +11,10 @@ import pytest
 from dirty_plant import write
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.export import Export
-from loopwright.pipeline.historian.headers import time_header
-from loopwright.pipeline.historian.reading import read_export
-from loopwright.pipeline.historian.times import clock_of
+from loopwright.pipeline.historian.files.export import Export
+from loopwright.pipeline.historian.files.file_reader import read_export
+from loopwright.pipeline.historian.files.headers import time_header
+from loopwright.pipeline.historian.files.time_stamps import clock_of
 
 START_S = 1_709_532_000.0  # 2024-03-04 06:00 UTC
 N = 40

@@ -10,9 +10,9 @@ import pytest
 from dirty_plant import TAGS, answer, clean, screen_of
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.exported import exported, signal_tags
-from loopwright.pipeline.historian.missing_codes import sentinels
-from loopwright.pipeline.historian.tags import Tag, named, read_tags
+from loopwright.pipeline.historian.cleaning.tag_checks import sentinels
+from loopwright.pipeline.historian.cleaning.tags import Tag, named, read_tags
+from loopwright.pipeline.historian.export_params import exported, signal_tags
 
 CERTAIN = tuple(replace(tag, unit_certain=True) for tag in TAGS)
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from dirty_plant import TAGS, cells, clean, screen, write
 
-from loopwright.pipeline.historian.findings import Finding
-from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.cleaning.findings import Finding
+from loopwright.pipeline.historian.cleaning.tags import Tag
 
 AMBIENT = Tag("SITE_TI_99.PV", "pv", "degC")
 

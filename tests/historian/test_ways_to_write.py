@@ -18,8 +18,8 @@ import pytest
 from dirty_plant import TAGS, cells, clean, write
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.reading import read_export, tags_in, units_of
-from loopwright.pipeline.historian.tags import parse_tag
+from loopwright.pipeline.historian.cleaning.tags import parse_tag
+from loopwright.pipeline.historian.files.file_reader import read_export, tags_in, units_of
 
 N = 60
 DATA = clean(N)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.pipeline.historian.grid import Grid
-from loopwright.pipeline.historian.old_controller import old_controllers
-from loopwright.pipeline.historian.operated import operated
-from loopwright.pipeline.historian.tags import Tag
+from loopwright.pipeline.historian.cleaning.grid import Grid
+from loopwright.pipeline.historian.cleaning.tags import Tag
+from loopwright.pipeline.historian.old_loops import old_controllers, operated
 from loopwright.pipeline.records.operated import operation
 
 SP = np.array([10.0, 10.0, 10.0, 12.0, 12.0, 12.0])

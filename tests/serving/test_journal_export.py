@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from loopwright.pipeline.historian.tags import read_tags
+from loopwright.pipeline.historian.cleaning.tags import read_tags
 from loopwright.serving import Controller, Signal
 from loopwright.serving.journal import Journal, Scan, columns
 from loopwright.serving.station.export import export, tag_table

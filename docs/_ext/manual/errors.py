@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from loopwright.pipeline.evaluation.evidence import NotMeasuredError
-from loopwright.pipeline.historian.tags import TableError
+from loopwright.pipeline.historian.cleaning.tags import TableError
 from loopwright.serving.errors import LoopwrightError
 from manual.markdown import code, prose, table
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.tuning.responses import reached
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopwright.pipeline.config.known import NONE, NOTHING, SURE, Known
-from loopwright.pipeline.historian.known_record import Beside
+from loopwright.pipeline.historian.answers import Beside
 from loopwright.pipeline.records.record import Record
 
 AGREES, OPEN, MODEL, CONTRADICTED, UNUSED = "agrees", "open", "model", "contradicted", "unused"

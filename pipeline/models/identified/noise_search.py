@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.assembly import step_responses
 from loopwright.pipeline.models.identified.candidates import Task
 from loopwright.pipeline.models.identified.innovations import innovations

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.config.known import SURE
-from loopwright.pipeline.historian.direct import DirectModel
+from loopwright.pipeline.historian.answers import DirectModel
 from loopwright.pipeline.historian.feedback import follows
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_start import high_order_arx

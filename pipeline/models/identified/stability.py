@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.rests import settle
 from loopwright.pipeline.plants.simulator import Array

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from loopwright.pipeline.historian.answers import Beside, beside_record
 from loopwright.pipeline.historian.feedback import fed_back
-from loopwright.pipeline.historian.known_record import Beside, beside_record
 from loopwright.pipeline.models.identified.knowledge import Knowledge
 from loopwright.pipeline.models.identified.rounds import Rounds
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds, informative

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.historian.pace import MOST_PERIODS
+from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.metrics import fit_percent
 from loopwright.pipeline.models.identified.assembly import dead_periods, step_responses
 from loopwright.pipeline.models.identified.doubt import spread

@@ -1,0 +1,301 @@
+"""How a PV answers to an input, read from one-step predictions: right in a closed loop too, and honest about doubt.
+
+A free run under feedback can take the controller, read backwards, for the plant: PV = set point - MV / Kc. A one-step
+prediction that knows the PV's own past cannot, because what the controller made of that past tells it nothing new:
+only moves of the MV that do not come from the PV do (set points, steps by hand, another loop). Where there are none,
+the coefficients are free, and so is the sign.
+
+Source: L. Ljung, System Identification: Theory for the User, 2nd ed., 1999, chapter 13 (the direct method).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, solve_toeplitz, solve_triangular, toeplitz
+
+from loopwright.pipeline.config.known import NONE, NOTHING, SURE, Known
+from loopwright.pipeline.historian.arx_model import Blocks, blocks_of
+from loopwright.pipeline.metrics import Array
+from loopwright.pipeline.records.record import Record
+
+FINE = 6  # lags with a coefficient of their own; later ones share one
+WIDER = 1.5  # a block over the one before
+MOST_LAGS, SHORTEST = 160, 10  # lags
+ROWS_A_COEFFICIENT = 6
+SCORES = 40  # parts of the rows whose sums say how far the coefficients may be off
+FLAT = 1e-12  # eigenvalue of the regressors' covariance, over the largest, below which a direction never moved
+DRAWS = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DirectModel:
+    """y(k+1) = sum_b a_b mean(y over block b) + sum_j sum_b b_jb mean(u_j over block b) + c + e(k+1), least squares.
+
+    ``theta`` (p,) and its covariance (p, p) hold the blocks of y, then those of each input, then c. The covariance is
+    that of white residuals and that of sums over neighbouring rows together; a direction in which the regressors never
+    moved is as free as noise leaves it.
+    """
+
+    theta: Array
+    covariance: Array
+    blocks: Blocks
+    inputs: int
+    sd: float  # of e
+    rows: int
+
+    @classmethod
+    def of(cls, y: Array, u: Array, run: NDArray[np.int64], longest: int = 40) -> DirectModel | None:
+        """Fit to a PV y (n,) and its inputs u (n, m), with lags up to ``longest`` rows; None where rows are too few."""
+        longest = min(max(longest, SHORTEST), MOST_LAGS)
+        while True:
+            blocks = blocks_to(longest)
+            k = np.arange(longest, len(y) - 1)
+            k = k[run[k - longest] == run[k + 1]]
+            if len(k) >= ROWS_A_COEFFICIENT * (len(blocks) * (1 + u.shape[1]) + 1):
+                break
+            if longest <= SHORTEST:
+                return None
+            longest = max(longest // 2, SHORTEST)
+        columns = [blocks_of(c - c.mean(), k, blocks) for c in (y, *u.T)]
+        x = np.column_stack([*columns, np.ones(len(k))])
+        target = y[k + 1] - y.mean()
+        scale = np.where(x.std(axis=0) > 0, x.std(axis=0), 1.0)
+        z, n = x / scale, len(k)
+        values, vectors = np.linalg.eigh(z.T @ z / n)
+        least = FLAT * values[-1]
+        moved = values > least
+        known, lost = vectors[:, moved], vectors[:, ~moved]
+        inverse = (known / values[moved]) @ known.T
+        theta = inverse @ (z.T @ target / n)
+        e = target - z @ theta
+        edges = np.linspace(0, n, SCORES + 1).astype(int)
+        scores = np.array([z[i:j].T @ e[i:j] for i, j in pairwise(edges)]) / n
+        white = float(e.var()) / n
+        covariance = white * (inverse + lost @ lost.T / least) + inverse @ (scores.T @ scores) @ inverse
+        return cls(theta / scale, covariance / np.outer(scale, scale), blocks, u.shape[1], float(e.std()), n)
+
+    def answer(self, j: int, first: int, last: int) -> tuple[float, float]:
+        """(mean answer over rows ``first`` to ``last`` after a unit step of input j, its standard deviation).
+
+        From the middle two thirds of ``DRAWS`` sets of coefficients that are as likely as these.
+        """
+        rng = np.random.default_rng(0)
+        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
+        spread = vectors * np.sqrt(np.maximum(values, 0.0))
+        thetas = self.theta + rng.standard_normal((DRAWS, len(values))) @ spread.T
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = self._steps(np.vstack([self.theta, thetas]), j, last)[:, first - 1 :].mean(axis=1)
+        found = np.nan_to_num(found, posinf=1e300, neginf=-1e300)
+        low, high = np.quantile(found[1:], [0.16, 0.84])
+        return float(found[0]), float(max(high / 2 - low / 2, 1e-300))
+
+    def answer_within(self, j: int, first: int, last: int, most: float) -> tuple[float, float] | None:
+        """``answer``; None where it goes beyond ``most``: coefficients under which a PV explodes say nothing."""
+        value, sd = self.answer(j, first, last)
+        return (value, sd) if abs(value) <= most else None
+
+    def _steps(self, thetas: Array, j: int, rows: int) -> Array:
+        """Answers (d, rows) to a unit step of input j under coefficients (d, p)."""
+        m, longest = len(self.blocks), self.blocks[-1][1]
+        widths = np.repeat([b - a for a, b in self.blocks], [b - a for a, b in self.blocks])
+        of = np.repeat(np.arange(m), [b - a for a, b in self.blocks])
+        own, pushes = thetas[:, of] / widths, np.cumsum(thetas[:, m * (1 + j) + of] / widths, axis=1)
+        y = np.zeros((len(thetas), longest + rows))
+        for k in range(rows):
+            past = y[:, k : k + longest][:, ::-1]
+            y[:, longest + k] = np.einsum("ij,ij->i", own, past) + pushes[:, min(k, longest - 1)]
+        return y[:, longest:]
+
+
+def blocks_to(longest: int) -> Blocks:
+    """Blocks of lags from 0 to ``longest``, the first ones of one lag each, the later ones wider and wider."""
+    edges = list(range(min(FINE, longest) + 1))
+    width = 2.0
+    while edges[-1] < longest:
+        edges.append(min(edges[-1] + int(width), longest))
+        width *= WIDER
+    return tuple(pairwise(edges))
+
+
+# ------------------------------------------------------------------------------------------ the first row of an answer
+FOLLOWED = 80  # rows after a move, whose sum has the sign of the answer
+ROWS_AFTER, LEAD = 320, 20  # rows after a move, and before it: then the export stores it late
+SEEN = 6.0  # standard deviations of what chance gives: an answer at all
+BEGINS = 4.5  # standard deviations of the first row of an answer, of which many are looked at
+LEAST = 0.05  # of the clearest row: below it a misfit of the model looks like an answer
+PART, CHANCE = 0.25, 9.0  # of the largest change: an answer that begins so is excluded where its chi-squared is this
+AGAIN = 3.0  # standard deviations that are not taken for chance there
+COLOUR = 12  # rows that noise remembers
+MOST_ROWS = 400_000  # rows that are looked at
+RIDGE = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class FirstAnswer:
+    """Rows from a move to the first row that differs by it: ``last``, or from ``first`` on beneath the noise.
+
+    Where ``last`` is below 1 the PV answers before the move: its column is late. ``feedback``: an operator or a
+    controller moves the input against what the PV did before, which is no answer.
+    """
+
+    first: int
+    last: int
+    feedback: bool = False
+
+
+def first_answer(y: Array, u: Array, run: NDArray[np.int64]) -> FirstAnswer | None:
+    """The first row of y (n,) that a move of u (n,) changes; None where no answer is seen.
+
+        y(k+1) - y(k) = sum_l h_l (u(k-l) - u(k-l-1)) + e(k),   e(k) = sum_i a_i e(k-i) + w(k)
+
+    for l = -LEAD .. ROWS_AFTER - 1 by least squares on both sides filtered by 1 - a(q), so that w is white: once noise
+    of y, drifts and an integrator are in a, one row more is told from noise. z_l is what lag l adds to all later ones,
+    in standard deviations: the answer begins at the first l where it is more than BEGINS. At most LEAD rows are looked
+    back. Where the z_l before a move have the other sign than the answer, they are feedback, and the answer begins
+    after the move.
+    """
+    from scipy.signal import fftconvolve, lfilter
+
+    n = min(len(y), MOST_ROWS)
+    du, dy = np.diff(u[:n], prepend=u[:1]), np.diff(y[:n], append=y[n - 1 : n])
+    inside = run[1:n] == run[: n - 1]
+    du[1:][~inside], dy[:-1][~inside] = 0.0, 0.0
+    du, dy = np.nan_to_num(du), np.nan_to_num(dy)
+    if not du.any() or not dy.any() or n < 4 * ROWS_AFTER:
+        return None
+    h = _answer(du, dy)[0]
+    white = whitening(dy - fftconvolve(du, h)[LEAD : LEAD + n])
+    du, dy = lfilter(white, [1.0], du), lfilter(white, [1.0], dy)
+    h, z, size = _answer(du, dy)
+    clearest = float(np.abs(z).max())
+    if max(clearest, float((np.abs(h) * size).max())) < SEEN:
+        return None
+    least = max(BEGINS, LEAST * clearest)
+    begins = np.abs(z) >= least
+    answer = np.cumsum(h[LEAD : LEAD + FOLLOWED])
+    way = float(np.sign(answer[int(np.abs(answer).argmax())]))
+    before, after = -way * float(z[:LEAD].sum()) / np.sqrt(LEAD), float((way * z[LEAD:]).max())
+    feedback = before >= least and after >= SEEN
+    if feedback:  # what precedes a move is its cause
+        begins &= np.sign(z) == way
+        begins[:LEAD] = False
+    if not begins.any():
+        return None
+    last = int(begins.argmax())
+    first = max(_earliest(last, h, way * z if feedback else np.abs(z), size), LEAD if feedback else 0)
+    return FirstAnswer(first + 1 - LEAD, last + 1 - LEAD, feedback)
+
+
+def _earliest(last: int, h: Array, z: Array, size: Array) -> int:
+    """The earliest lag at which an answer of some size may begin too, within what chance gives."""
+    strongest = float(np.abs(h[last : last + LEAD]).max())
+    first, total = last, 0.0
+    for lag in range(last - 1, -1, -1):
+        total += (PART * strongest * float(size[lag])) ** 2
+        if total >= CHANCE and z[lag] < AGAIN:
+            break
+        first = lag
+    return first
+
+
+def _answer(du: Array, dy: Array) -> tuple[Array, Array, Array]:
+    """h, z, and the standard deviations in one unit of h where all later lags are known; (lags,) each."""
+    n, lags = len(du), LEAD + ROWS_AFTER
+    size = 1 << (n + lags).bit_length()
+    spectrum = np.fft.rfft(du, size)
+    both = np.fft.irfft(np.conj(spectrum) * np.fft.rfft(dy, size), size)
+    own = np.fft.irfft(np.abs(spectrum) ** 2, size)[:lags]
+    cross = np.r_[both[-LEAD:], both[:ROWS_AFTER]]
+    gram = toeplitz(own) + RIDGE * own[0] * np.eye(lags)
+    # The same matrix from the last lag to the first: a row of its Cholesky factor adds a lag to those after it.
+    factor = np.linalg.cholesky(gram)
+    h = cho_solve((factor, True), cross)
+    left = max(float(dy @ dy - h @ cross), 1e-12 * float(dy @ dy)) / max(n - lags, 1)
+    added = solve_triangular(factor, cross[::-1], lower=True)[::-1]
+    return h, added / np.sqrt(left), np.diag(factor)[::-1] / np.sqrt(left)
+
+
+def whitening(e: Array) -> Array:
+    """1, -a_1 .. -a_COLOUR of e(k) = sum_i a_i e(k-i) + w(k), by Yule and Walker."""
+    size = 1 << (len(e) + COLOUR).bit_length()
+    own = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: COLOUR + 1]
+    own[0] = own[0] * (1.0 + 1e-9) + 1e-300  # nothing at all is white too
+    return np.r_[1.0, -solve_toeplitz(own[:COLOUR], own[1:])]
+
+
+# ---------------------------------------------------------------------------- a record beside an engineer's statements
+WINDOWS = ((20, 30), (40, 60), (60, 90))
+"""Rows after a step over which an answer is taken; the last ones come nearest to the gain."""
+
+SETTLED = 0.1
+"""Share of an answer by which it may still change from the last window but one to the last where it has settled."""
+
+ANY_ANSWER = 1e3
+"""Change of a PV by a move of an input, both over their deviations: beyond it a model explodes and says nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Beside:
+    """A statement beside the record: the ``answer`` (value, standard deviation) [PV/input] that is most certain.
+
+    None where the rows are too few, or where their model explodes. ``objection`` is the answer that contradicts the
+    statement for certain; None where none does.
+    """
+
+    known: Known
+    answer: tuple[float, float] | None = None
+    objection: tuple[float, float] | None = None
+
+    @property
+    def question(self) -> str:
+        """The question to ask; empty where nothing speaks against the statement."""
+        return "" if self.objection is None else self.known.question(*self.objection)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the record by itself is certain of the sign that is said."""
+        return self.answer is not None and self.known.way * self.answer[0] >= SURE * self.answer[1]
+
+
+def beside_record(known: Sequence[Known], record: Record) -> list[Beside]:
+    """Each statement beside the record.
+
+    A sign is contradicted by an answer that is certain to have the other one and keeps it in the last window; ``none``
+    by one that is certain to be more than ``NOTHING``. A stated gain can only be too large for an answer that has not
+    settled.
+    """
+    pvs, inputs = [s.name for s in record.pv_signals], [s.name for s in (*record.mv_signals, *record.dv_signals)]
+    moves, found = np.hstack([record.mv, record.dv]), list[Beside]()
+    for one in known:
+        i, j = pvs.index(one.pv), inputs.index(one.input)
+        model = DirectModel.of(record.pv[:, i], moves, record.run, WINDOWS[-1][1])
+        unit = float(record.pv[:, i].std() / max(moves[:, j].std(), 1e-300))
+        answers = [] if model is None else [model.answer_within(j, *rows, ANY_ANSWER * unit) for rows in WINDOWS]
+        known_answers = [a for a in answers if a is not None]
+        if not known_answers or answers[-1] is None:
+            found.append(Beside(one))
+            continue
+        surest = max(known_answers, key=lambda a: abs(a[0]) / a[1])
+        found.append(Beside(one, surest, _objection(one, known_answers, NOTHING * unit)))
+    return found
+
+
+def _objection(one: Known, answers: Sequence[tuple[float, float]], nothing: float) -> tuple[float, float] | None:
+    """The answer that contradicts the statement; ``answers`` of the windows, the last one last."""
+    last = answers[-1]
+    if one.sign == NONE:
+        return next((a for a in answers if one.excludes(*a, nothing)), None)
+    other = [a for a in answers if one.way * a[0] < -SURE * a[1]]
+    if other and one.way * last[0] < 0:
+        return max(other, key=lambda a: abs(a[0]) / a[1])
+    if one.gain is None or not one.excludes(*last):
+        return None
+    settled = len(answers) > 1 and abs(last[0] - answers[-2][0]) <= max(SETTLED * abs(last[0]), last[1])
+    low, high = one.gains
+    beyond = last[0] > max(high, 0.0) or last[0] < min(low, 0.0)  # further from 0 than any gain that is said
+    return last if settled or beyond else None
