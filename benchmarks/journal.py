@@ -10,7 +10,7 @@ import argparse
 
 import numpy as np
 
-from loopwright.serving.journal.packing import packed
+from loopwright.serving.journal.entries import packed
 from loopwright.serving.journal.writer import BLOCK
 
 SET_POINTS, STEP = 3, 400 / 4096

@@ -22,8 +22,7 @@ from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models.identified.assembly import assembled, noise_of
 from loopwright.pipeline.models.identified.identified import Identified
-from loopwright.pipeline.models.identified.lagged_start import with_units
-from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
+from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx, with_units
 from loopwright.pipeline.models.identified.output_error import OutputError, residuals
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds
 from loopwright.pipeline.plants.signals import Signals

@@ -8,18 +8,55 @@ from collections.abc import Callable
 from math import inf, isfinite
 from os import PathLike
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple, NoReturn, TypeAlias
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.digest import DIGEST_KEY, file_digest, unseal
+from loopwright.serving.controller_file import DIGEST_KEY, file_digest, unseal
 from loopwright.serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
-from loopwright.serving.graph_audit import MAX_BYTES, audit
+from loopwright.serving.graph.audit import MAX_BYTES, audit
 from loopwright.serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
 from loopwright.serving.ranges import numbers
-from loopwright.serving.step_lock import step_lock
 
+LONGEST_STEP_S = 1.0  # a fork waits no longer for a step
+_locks: WeakSet[Lock] = WeakSet()  # of all controllers of this process
+_held: list[Lock] = []  # by the thread that forks
+_forking = Lock()
+
+
+def step_lock() -> Lock:
+    """A lock that is free in every child of this process, whoever holds it at the fork."""
+    lock = Lock()
+    _locks.add(lock)
+    return lock
+
+
+def _before() -> None:
+    _forking.acquire()
+    _held.extend(lock for lock in list(_locks) if lock.acquire(timeout=LONGEST_STEP_S))
+
+
+def _in_parent() -> None:
+    while _held:
+        _held.pop().release()
+    _forking.release()
+
+
+def _in_child() -> None:
+    _held.clear()
+    for lock in (*_locks, _forking):
+        if lock.locked():  # by this thread, or by one whose step took too long and that the child has not
+            lock.release()
+
+
+if hasattr(os, "register_at_fork"):  # where processes fork
+    os.register_at_fork(before=_before, after_in_parent=_in_parent, after_in_child=_in_child)
+
+
+# ------------------------------------------------------------------------------------------------------ the controller
 Array: TypeAlias = NDArray[np.float64]
 _LINE = 8  # float64 in a cache line: each vector starts on one, so that no result depends on its neighbours
 
@@ -47,7 +84,7 @@ class Controller:
     ------
     ArtifactError
         The file is corrupt, truncated, foreign or changed, holds what a controller may not
-        (see ``loopwright.serving.graph_audit``), or its manifest and its graph disagree.
+        (see ``loopwright.serving.graph.audit``), or its manifest and its graph disagree.
 
     Notes
     -----

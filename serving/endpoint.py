@@ -28,7 +28,7 @@ class Endpoint(Protocol):
 
 @runtime_checkable
 class HandsBack(Protocol):
-    """An endpoint that can give the plant to the plant's own controller, for ``loopwright.serving.fallback``."""
+    """An endpoint that can give the plant to the plant's own controller, for ``loopwright.serving.modes``."""
 
     def hand_back(self) -> None:
         """Give the plant back."""

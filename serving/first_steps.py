@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from itertools import product
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,12 +23,22 @@ import numpy as np
 from loopwright.serving import controller, trust
 from loopwright.serving.errors import ArtifactError, LoopwrightError, OutputError
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.own_process import module
 from loopwright.serving.words import first_line, plain
 
 if TYPE_CHECKING:
     from loopwright.serving.signing.verify import Trusted
 
+HOME = Path(__file__).resolve().parents[2]  # of the folder loopwright, where this package lies in one
+
+
+def module(name: str, *arguments: str) -> tuple[list[str], dict[str, str]]:
+    """The command that runs a module with arguments, and its environment: it finds what this process finds."""
+    places = dict.fromkeys([*filter(None, sys.path), str(HOME)])  # an empty one is the current folder
+    command = [sys.executable, "-P", "-m", name, *arguments]
+    return command, {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
+
+
+# --------------------------------------------------------------------------------------------------------- first steps
 DEADLINE_S = 30.0  # of the whole process; it takes .3 s, and a step at most 2 s
 CHAINED = 3  # steps from a state of zeros at each set of inputs
 REFUSED = 2  # exit status of a process whose file is refused

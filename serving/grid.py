@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
-from loopwright.serving.fault import told_by
-from loopwright.serving.guard import Sample
+from loopwright.serving.guard import Sample, told_by
 from loopwright.serving.words import named
 
 if TYPE_CHECKING:

@@ -10,20 +10,16 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.applied import AppliedMV
+from loopwright.serving.active_controller import Guards, InCharge, Successor
 from loopwright.serving.clock import Clock, MonotonicClock
-from loopwright.serving.command import Command
 from loopwright.serving.controller import Controller
 from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
-from loopwright.serving.fallback import Fallback
-from loopwright.serving.fault import reworded
 from loopwright.serving.grid import RunReport, run_on_grid
-from loopwright.serving.guard import Guard, Sample, default_guards
-from loopwright.serving.in_charge import Guards, InCharge
-from loopwright.serving.mode import LoopMode, Mode, mode_of
+from loopwright.serving.guard import Guard, Sample, default_guards, reworded
+from loopwright.serving.modes import Command, Fallback, LoopMode, Mode, mode_of
+from loopwright.serving.mv_readback import AppliedMV
 from loopwright.serving.ranges import within
-from loopwright.serving.successor import Successor
 from loopwright.serving.transfer import ByHand, Transfer
 from loopwright.serving.words import first_line
 
@@ -81,7 +77,7 @@ class ControlLoop:
         After a change to AUTO or of the controller, an MV crosses its range at most once in this time [s], until it
         is where the law wants it; 0: at once. See ``loopwright.serving.transfer``.
     fallback
-        What to do when a fault lasts; None: the MV stays. See ``loopwright.serving.fallback``.
+        What to do when a fault lasts; None: the MV stays. See ``loopwright.serving.modes``.
 
     Raises
     ------

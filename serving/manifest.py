@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import Any, Self
 
 from loopwright.serving.errors import ArtifactError
-from loopwright.serving.plain_values import MAX_DIGITS, refused, shown
+from loopwright.serving.fields import MAX_DIGITS, refused, shown
 from loopwright.serving.words import ACTS
 
 SCHEMA = 1

@@ -10,8 +10,8 @@ from os import PathLike
 from typing import TYPE_CHECKING
 
 from loopwright.serving import controller
+from loopwright.serving.active_controller import Fitted
 from loopwright.serving.errors import ArtifactError
-from loopwright.serving.fitted import Fitted
 
 if TYPE_CHECKING:
     from loopwright.serving.signing.verify import Signed, Trusted
@@ -37,7 +37,7 @@ class Controller(controller.Controller):
         The file is unsigned, signed by none of ``trusted``, or changed since; or its signature expired.
     ArtifactError
         The file is corrupt, truncated, foreign or changed, holds what a controller may not
-        (see ``loopwright.serving.graph_audit``), or its manifest and its graph disagree.
+        (see ``loopwright.serving.graph.audit``), or its manifest and its graph disagree.
 
     Notes
     -----

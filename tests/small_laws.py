@@ -17,7 +17,7 @@ from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import ControlLaw
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving import Controller, Signal
-from loopwright.serving.digest import TRAILER_BYTES
+from loopwright.serving.controller_file import TRAILER_BYTES
 
 SIGNALS = Signals(
     period_s=0.5,

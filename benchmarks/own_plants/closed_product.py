@@ -23,7 +23,7 @@ from plant import OwnPlant
 from torch import Tensor
 
 from loopwright.pipeline.commands import new
-from loopwright.pipeline.commands.new_exported import asked, given_tags
+from loopwright.pipeline.commands.own_plant.from_export import asked, given_tags
 from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
 from loopwright.pipeline.historian.cleaning.tags import named
 from loopwright.pipeline.historian.export_params import screened_export, with_units

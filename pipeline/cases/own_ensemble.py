@@ -11,12 +11,12 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from loopwright.pipeline.cases.operating_range import Reach, visited_mv
 from loopwright.pipeline.cases.own_model import Doubts, OwnPlant, doubted, suits
-from loopwright.pipeline.cases.reach import Reach, visited_mv
 from loopwright.pipeline.config.exports import is_exported
 from loopwright.pipeline.errors import ModelError, PlantError, RecordError
 from loopwright.pipeline.evaluation.case import Array, Case
-from loopwright.pipeline.evaluation.grounds import RecordVerdict
+from loopwright.pipeline.evaluation.evidence_basis import RecordVerdict
 from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
 from loopwright.pipeline.evaluation.one_side import before_turns, on_one_side
 from loopwright.pipeline.files import read_json

@@ -7,7 +7,7 @@ from typing import Any
 
 from loopwright.pipeline.cases.own_ensemble import LAW_PART, MODEL_SET
 from loopwright.pipeline.config.exports import ExportParams, screened_record
-from loopwright.pipeline.records.old_controller import OldController
+from loopwright.pipeline.records.old_loops import OldController
 
 MEMBER_NUMBERS = (1, 2)
 OLD_LOOP = "old_loop"

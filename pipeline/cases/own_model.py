@@ -11,9 +11,9 @@ import numpy as np
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.plants.identified import IdentifiedPlant, longest_memory
+from loopwright.pipeline.plants.perturbed import SpoiltPlant, likely_error
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Array, Simulator
-from loopwright.pipeline.plants.spoilt import SpoiltPlant, likely_error
 
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
 LEAST_GAIN, LEAST_PACE, LEAST_DEAD = 0.25, 0.25, 1.0

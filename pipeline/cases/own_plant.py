@@ -11,13 +11,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from loopwright.pipeline.cases.daily_work import LEAST, day, spread, windows
-from loopwright.pipeline.cases.loads import held_load, load_size, whole_load
-from loopwright.pipeline.cases.measured_steps import course, level_of
+from loopwright.pipeline.cases.operating_range import TIMES
 from loopwright.pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
 from loopwright.pipeline.cases.own_entries import OLD_LOOP
 from loopwright.pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
-from loopwright.pipeline.cases.reach import TIMES
+from loopwright.pipeline.cases.own_tests import (
+    LEAST,
+    course,
+    day,
+    held_load,
+    level_of,
+    load_size,
+    spread,
+    whole_load,
+    windows,
+)
 from loopwright.pipeline.config.known import together
 from loopwright.pipeline.config.params import read_section, sections_of
 from loopwright.pipeline.config.plants import MvParams, PlantParams, SignalParams

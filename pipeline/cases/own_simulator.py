@@ -9,8 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from loopwright.pipeline.cases.loads import ROOM, load_size
 from loopwright.pipeline.cases.own_plant import LOADED, OwnCase, own_case
+from loopwright.pipeline.cases.own_tests import ROOM, load_size
 from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.case import Array, Case

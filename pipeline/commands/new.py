@@ -14,13 +14,19 @@ import numpy as np
 
 from loopwright.pipeline.cases.own_entries import entries_of
 from loopwright.pipeline.commands.arguments import positive, whole
-from loopwright.pipeline.commands.new_commands import check_commands, check_start, commanded, confirmed, mvs_of
-from loopwright.pipeline.commands.new_exported import asked, given_tags, loop_lines, propose_tags
-from loopwright.pipeline.commands.new_fmu import table_from, write_table
-from loopwright.pipeline.commands.new_known import signals_as_tags, stated_of
-from loopwright.pipeline.commands.new_printed import tell
-from loopwright.pipeline.commands.new_replaced import REFUSED, check_replaceable, known_kept, limits_kept, wishes_lost
-from loopwright.pipeline.commands.new_simulated import Simulated, copy_name, keep, simulated
+from loopwright.pipeline.commands.own_plant.fmu_variables import table_from, write_table
+from loopwright.pipeline.commands.own_plant.from_export import asked, given_tags, loop_lines, propose_tags
+from loopwright.pipeline.commands.own_plant.from_simulator import Simulated, copy_name, keep, simulated
+from loopwright.pipeline.commands.own_plant.known_pairs import signals_as_tags, stated_of
+from loopwright.pipeline.commands.own_plant.mv_limits import check_commands, check_start, commanded, confirmed, mvs_of
+from loopwright.pipeline.commands.own_plant.printed import tell
+from loopwright.pipeline.commands.own_plant.replaced import (
+    REFUSED,
+    check_replaceable,
+    known_kept,
+    limits_kept,
+    wishes_lost,
+)
 from loopwright.pipeline.config.entries import add_entries
 from loopwright.pipeline.config.exports import ExportParams
 from loopwright.pipeline.config.params import sections

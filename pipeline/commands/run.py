@@ -15,7 +15,7 @@ from typing import Any
 
 from loopwright.pipeline.config.params import entries, sections, sections_of
 from loopwright.pipeline.engine.dvc import affected, ask, ask_in_turn, environment
-from loopwright.pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
+from loopwright.pipeline.engine.parent_death import end_with_parent, hear_no_interrupt
 from loopwright.pipeline.engine.start import STAGES as KINDS
 from loopwright.pipeline.errors import ParamsError, PipelineError, nearest
 from loopwright.pipeline.report.results import show_results, without_controller
@@ -111,7 +111,7 @@ def repro(targets: Sequence[str], changed: Iterable[str], expected: Sequence[str
         work = [*([] if targets else ["--rest"]), *(",".join(chain) for chain in chains)]
     else:
         work = ["repro", *(["--keep-going"] if keep_going else []), *targets]
-    lanes = [sys.executable, "-m", "loopwright.pipeline.engine.lanes", "--of", ",".join(expected), *work]
+    lanes = [sys.executable, "-m", "loopwright.pipeline.engine.parallel_dvc", "--of", ",".join(expected), *work]
     own, asked, running = os.getpid(), list[int](), list[subprocess.Popen[bytes]]()
 
     def begin() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from loopwright.pipeline.errors import ParamsError, nearest
-from loopwright.serving.plain_values import MAX_DIGITS
+from loopwright.serving.fields import MAX_DIGITS
 
 SECTIONS = ("cases", "exports", "records", "models", "plants", "controllers")
 OWN = "x-"  # a key that begins so is the user's, for values that aliases repeat

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from configparser import ConfigParser
 from pathlib import Path
 
-from loopwright.pipeline.engine.lifeline import end_with_parent, hear_no_interrupt
+from loopwright.pipeline.engine.parent_death import end_with_parent, hear_no_interrupt
 from loopwright.pipeline.errors import PipelineError
 
 PYTHON = (sys.executable, "-P")  # no package comes from the folder in which somebody stands: a numpy.py there would run

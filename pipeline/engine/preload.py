@@ -17,8 +17,8 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from loopwright.pipeline.engine.capture_output import listen
 from loopwright.pipeline.engine.fingerprint import fingerprint
-from loopwright.pipeline.engine.spoken import listen
 from loopwright.pipeline.engine.start import STAGES
 
 if TYPE_CHECKING:

@@ -15,11 +15,11 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from loopwright.pipeline.engine.capture_output import BARS
 from loopwright.pipeline.engine.cluster import connected
 from loopwright.pipeline.engine.fingerprint import difference, fingerprint
 from loopwright.pipeline.engine.folder import Folder, apply, read_files
-from loopwright.pipeline.engine.origin import commit, told
-from loopwright.pipeline.engine.spoken import BARS
+from loopwright.pipeline.engine.git_commit import commit, told
 from loopwright.pipeline.engine.stage_files import StageFiles
 
 FAILED = 2
@@ -63,11 +63,11 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     """(exit status, changed files, what was said last), pickled; on a worker."""
     from distributed import get_worker
 
+    from loopwright.pipeline.engine.capture_output import spoken_to
     from loopwright.pipeline.engine.command import run_stage
     from loopwright.pipeline.engine.pieces import Task, doing, mixture, still_wanted
     from loopwright.pipeline.engine.preload import unwatched
     from loopwright.pipeline.engine.progress import lines_anew
-    from loopwright.pipeline.engine.spoken import spoken_to
 
     worker, files = get_worker(), pickle.loads(read)
     unwatched(worker)

@@ -18,7 +18,7 @@ from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
 from loopwright.pipeline.evaluation.effort import Effort
-from loopwright.pipeline.evaluation.grounds import RecordVerdict
+from loopwright.pipeline.evaluation.evidence_basis import RecordVerdict
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
 from loopwright.pipeline.metrics import rmse
 from loopwright.pipeline.plants.equations import EquationPlant, equations

@@ -12,11 +12,11 @@ from typing import Any, Self
 
 from loopwright.pipeline.errors import PipelineError, ReportError
 from loopwright.pipeline.evaluation.case import Case, Curve
-from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.evidence_basis import Grounds
+from loopwright.pipeline.evaluation.extrapolation import grounds_of
 from loopwright.pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop, arrays
 from loopwright.pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from loopwright.pipeline.evaluation.model_evidence import model_figure
-from loopwright.pipeline.evaluation.reached import grounds_of
 from loopwright.pipeline.evaluation.typed_json import read_mapping
 from loopwright.pipeline.evaluation.validation import RelativeTo
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario

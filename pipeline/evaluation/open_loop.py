@@ -1,17 +1,24 @@
-"""The tests with the loop open: the MVs rest where they stand as a test begins."""
+"""Controllers whose loop is open: MVs that rest through a test, and the moves a law would have asked in the record."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
-from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.errors import PlantError, RecordError
 from loopwright.pipeline.evaluation.case import Array, Case
 from loopwright.pipeline.evaluation.metric import together
+from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import simulate_closed
+from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.manifest import Signal
 
+# ---------------------------------------------------------------------- the MVs rest where they stand as a test begins
 RUNS_AWAY = 1.0
 """Ranges of a controlled variable from its set point, where no plant and no transmitter goes."""
 
@@ -43,3 +50,92 @@ def _error(case: Case, tests: Sequence[Scenario]) -> float | None:
 
 def _rests(sp: Array, pv: Array, mv: Array) -> tuple[Array, Array]:
     return mv, np.empty(0)
+
+
+# ----------------------------------------------------------------------------------------- replay: nothing is fed back
+UNSEEN = 0.2  # share of the rows, the last ones: the choice of the model's structure held them out
+MOST = 2_000  # rows
+AT_END = 1e-3  # of an MV's range
+
+
+class Steps(Protocol):
+    """An object that steps a control law: ``loopwright.serving.Controller``."""
+
+    def cold_state(self) -> Array:
+        """The state of no past."""
+
+    def step(self, *, sp: Array, pv: Array, dv: Array, mv_applied: Array, state: Array) -> Any:
+        """(mv, state_next, info) from sp, pv, dv, mv_applied and state."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replay:
+    """Rows of a record with what a law asked for. The rows count on through the gaps of the record."""
+
+    time_s: Array  # (n,) rows times the period
+    sp: Array  # (n, n_sp) the set points that the law was given
+    pv: Array  # (n, n_sp) recorded controlled variables
+    asked: Array  # (n, n_mv); NaN where the controller refused the row
+    done: Array  # (n, n_mv) recorded
+
+    def figures(self, mvs: Sequence[Signal]) -> dict[str, dict[str, float]]:
+        """For each MV: distance of asked from done and its mean [% of range], correlation, share at an end [%].
+
+        ``mvs`` are the law's, with the ranges that it commands. The correlation is left out where either never moved.
+        """
+        found = {}
+        for i, signal in enumerate(mvs):
+            known = np.isfinite(self.asked[:, i])
+            asked, done, span = self.asked[known, i], self.done[known, i], signal.high - signal.low
+            if not asked.size:
+                found[signal.name] = {"refused": 100.0}
+                continue
+            ends = (asked <= signal.low + AT_END * span) | (asked >= signal.high - AT_END * span)
+            row = {
+                "distance": 100 * float(np.mean(np.abs(asked - done))) / span,
+                "more": 100 * float(np.mean(asked - done)) / span,
+                "at_end": 100 * float(np.mean(ends)),
+                "refused": 100 * float(np.mean(~known)),
+            }
+            if asked.std() > 1e-9 * span and done.std() > 1e-9 * span:
+                row["correlation"] = float(np.corrcoef(asked, done)[0, 1])
+            found[signal.name] = row
+        return found
+
+    def arrays(self) -> Mapping[str, Array]:
+        """By name, for a file."""
+        return {name: getattr(self, name) for name in ("time_s", "sp", "pv", "asked", "done")}
+
+
+def replay(law: Steps, record: Record, signals: Signals, ahead: int, *, same_row: bool = False) -> Replay:
+    """A law over the last fifth of a record, at most ``MOST`` rows, with the recorded PVs, disturbances and MVs.
+
+    No set point stands in a record. The law is given where the operation went: the mean of each recorded CV over the
+    next ``ahead`` samples of its run. ``signals`` are the law's. An MV acts on the outputs of the next row, or with
+    ``same_row`` on those of its own: then what was done at a row stands in the next one, and the last row of a run,
+    which has none, is left out. Raises RecordError where there are no two rows.
+    """
+    n = len(record)
+    first = max(n - round(UNSEEN * n), n - MOST, 0)
+    rows, n_sp, n_pv = np.arange(first, n), len(signals.sp), len(signals.pv)
+    begins = np.flatnonzero(np.r_[True, record.run[1:] != record.run[:-1]])
+    ends = np.append(begins[1:], n)[np.searchsorted(begins, rows, side="right") - 1]
+    known = rows + same_row < ends
+    rows, ends = rows[known], np.minimum(rows + ahead, ends)[known]
+    if len(rows) < 2:
+        raise RecordError(f"the record has {n} rows, too few to replay its last fifth; record more")
+    sp = np.array([record.pv[k:end, :n_sp].mean(axis=0) for k, end in zip(rows, ends, strict=True)])
+    done = record.mv[rows + same_row]
+    asked, state = np.empty(done.shape), law.cold_state()
+    for i, k in enumerate(rows):
+        fresh = i == 0 or k in begins
+        state = law.cold_state() if fresh else state
+        # What acted over the last period; nobody knows it of the first row of a run, unless it stands in that row.
+        before = record.mv[k if same_row or fresh else k - 1]
+        try:
+            pv, dv = record.pv[k, :n_pv], record.dv[k]
+            asked[i], state, _ = law.step(sp=sp[i], pv=pv, dv=dv, mv_applied=before, state=state)
+        except LoopwrightError:
+            asked[i], state = np.nan, law.cold_state()
+    time_s = record.period_s * np.arange(len(rows), dtype=np.float64)
+    return Replay(time_s, sp, record.pv[rows, :n_sp], asked, done)

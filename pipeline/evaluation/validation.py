@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.law_evidence import Analysis, Row
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 

@@ -11,7 +11,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from loopwright.pipeline.errors import ExportError
-from loopwright.serving.graph_audit import MAX_IR
+from loopwright.serving.graph.audit import MAX_IR
 
 OPSET = 18
 RUNS = "n"  # the first dimension of every input and output: runs side by side

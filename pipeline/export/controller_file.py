@@ -16,9 +16,8 @@ import onnx
 
 from loopwright.pipeline.files import draft_of, write_text
 from loopwright.serving.controller import Controller
-from loopwright.serving.digest import TRAILER_BYTES, file_digest, seal
+from loopwright.serving.controller_file import TRAILER_BYTES, file_digest, seal, sidecar
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
-from loopwright.serving.sidecar import sidecar
 
 
 def with_evidence(src: str | Path, dst: str | Path, evidence: Mapping[str, Any]) -> Manifest:

@@ -17,7 +17,7 @@ from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export.operators import check_operators
 from loopwright.pipeline.export.torch_exporter import nothing_twice, quiet
 from loopwright.pipeline.laws.base import ControlLaw
-from loopwright.serving.graph_audit import MAX_IR
+from loopwright.serving.graph.audit import MAX_IR
 from loopwright.serving.manifest import INPUTS
 
 OPSET = 18  # the exporter's own: no version conversion, and older runtimes read it

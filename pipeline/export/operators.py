@@ -7,7 +7,7 @@ import onnx
 from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.serving.errors import ArtifactError
-from loopwright.serving.graph_audit import audit
+from loopwright.serving.graph.audit import audit
 
 # Behind these a value is no longer a transposed matrix.
 RESHAPING = frozenset({"Flatten", "Gather", "Gemm", "MatMul", "Reshape", "Squeeze"})

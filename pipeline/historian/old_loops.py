@@ -12,8 +12,7 @@ from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.tags import Tag, automatic, by_hand
 from loopwright.pipeline.historian.guessing import loop_in
 from loopwright.pipeline.metrics import Array
-from loopwright.pipeline.records.old_controller import OldController
-from loopwright.pipeline.records.operated import Operated, operation
+from loopwright.pipeline.records.old_loops import OldController, Operated, operation
 from loopwright.pipeline.records.set_points import SetPoints
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw, hold_numbers, require_single_loop
 from loopwright.pipeline.laws.gain_update import PidForm, gain_update
-from loopwright.pipeline.laws.ranges import OfRange, ascend, in_units
+from loopwright.pipeline.laws.scaled_defaults import OfRange, ascend, in_units
 from loopwright.pipeline.models.memory import Memory, Named, Slot
 from loopwright.pipeline.plants.signals import Signals
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from loopwright.pipeline.evaluation.standing import LawStanding, Standing, tally
+from loopwright.pipeline.evaluation.leaderboard import LawStanding, Standing, tally
 from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.report.templating import REGISTRY_URL, render, write_pages
 

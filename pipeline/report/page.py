@@ -9,8 +9,8 @@ from typing import Any
 
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import lock_up_text
+from loopwright.pipeline.evaluation.leaderboard import because, by_reason
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
-from loopwright.pipeline.evaluation.standing import because, by_reason
 from loopwright.pipeline.evaluation.validation import FILE, reference_words
 from loopwright.pipeline.evaluation.verdicts import Claims
 from loopwright.pipeline.optimal.bounds import bounded

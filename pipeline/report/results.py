@@ -13,8 +13,8 @@ from rich.table import Table
 
 from loopwright.pipeline.config.params import PARAMS_FILE, entries, sections
 from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.evaluation.leaderboard import LawStanding, Standing, by_reason, tally, withheld_in
 from loopwright.pipeline.evaluation.metric import with_unit
-from loopwright.pipeline.evaluation.standing import LawStanding, Standing, by_reason, tally, withheld_in
 from loopwright.pipeline.evaluation.validation import FILE, Validation
 from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.simulation import NOISE_SUFFIX

@@ -24,7 +24,7 @@ from loopwright.pipeline.config.params import entries, read_section, sections
 from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.engine.stage_files import DATA, EVERY
-from loopwright.pipeline.evaluation.grounds import SCREENING
+from loopwright.pipeline.evaluation.evidence_basis import SCREENING
 from loopwright.pipeline.files import digest, sha256, write_json
 from loopwright.pipeline.records.set_points import SET_POINTS
 from loopwright.pipeline.stages.paths import WORK
@@ -61,7 +61,7 @@ APART = {
         # What trained the models has had its effect.
         *((f"{PIPELINE}.models", what) for what in _of(PIPELINE, "metrics", "records", "historian")),
         # The parity gate says whether the runtime agrees with the law, and changes nothing.
-        *(("", what) for what in _of(SERVING, "controller", "graph_audit")),
+        *(("", what) for what in _of(SERVING, "controller", "graph")),
     },
 }
 # Stage -> the modules beside case.py that it loads.

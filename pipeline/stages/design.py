@@ -16,7 +16,7 @@ import numpy as np
 from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.config.params import ControllerParams, choose, parse
 from loopwright.pipeline.engine.command import reason, run_stage
-from loopwright.pipeline.engine.origin import commit
+from loopwright.pipeline.engine.git_commit import commit
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import LawError, PipelineError, WithheldError
 from loopwright.pipeline.evaluation.case import Case
@@ -27,7 +27,7 @@ from loopwright.pipeline.evaluation.proof import sign_doubts
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.files import digest, read_json, write_json
 from loopwright.pipeline.laws import LAWS, ControlLaw
-from loopwright.pipeline.laws.fitting import require_fit
+from loopwright.pipeline.laws.suitability import require_fit
 from loopwright.pipeline.models import load_model
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.simulator import Array, Simulator

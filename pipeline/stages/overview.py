@@ -8,7 +8,7 @@ from pathlib import Path
 
 from loopwright.pipeline.config.params import sections
 from loopwright.pipeline.engine.command import run_stage
-from loopwright.pipeline.evaluation.standing import Standing
+from loopwright.pipeline.evaluation.leaderboard import Standing
 from loopwright.pipeline.evaluation.validation import FILE
 from loopwright.pipeline.report.overview import PAGES, write_overview
 from loopwright.pipeline.stages.paths import ARTIFACTS

@@ -19,7 +19,8 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.dead_time import dead_times
 from loopwright.pipeline.evaluation.evidence import WITHHELD, Evidence
-from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.evidence_basis import Grounds
+from loopwright.pipeline.evaluation.extrapolation import grounds_of, widest
 from loopwright.pipeline.evaluation.law_evidence import (
     BASE,
     Analysis,
@@ -30,12 +31,9 @@ from loopwright.pipeline.evaluation.law_evidence import (
     lock_up_text,
 )
 from loopwright.pipeline.evaluation.model_evidence import identified_part
-from loopwright.pipeline.evaluation.open_loop import errors_at_rest
+from loopwright.pipeline.evaluation.open_loop import errors_at_rest, replay
 from loopwright.pipeline.evaluation.poor_laws import why_poor
-from loopwright.pipeline.evaluation.reached import grounds_of, widest
-from loopwright.pipeline.evaluation.replay import replay
-from loopwright.pipeline.evaluation.trial import Metrics, Trial, step_us
-from loopwright.pipeline.evaluation.trials import try_files
+from loopwright.pipeline.evaluation.trials import Metrics, Trial, step_us, try_files
 from loopwright.pipeline.export.controller_file import with_evidence, withhold
 from loopwright.pipeline.files import read_json, write_json
 from loopwright.pipeline.stages.paths import (

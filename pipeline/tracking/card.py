@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from html import escape
 
 from loopwright.pipeline.evaluation.law_evidence import Analysis
+from loopwright.pipeline.evaluation.leaderboard import because
 from loopwright.pipeline.evaluation.metric import ratio_to_bound, with_unit
-from loopwright.pipeline.evaluation.standing import because
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 from loopwright.pipeline.tracking.gate import Gate, Rank

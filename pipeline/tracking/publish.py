@@ -10,7 +10,7 @@ from typing import Any
 
 from mlflow import MlflowClient
 
-from loopwright.pipeline.evaluation.standing import withheld_in
+from loopwright.pipeline.evaluation.leaderboard import withheld_in
 from loopwright.pipeline.evaluation.validation import FILE, Validation
 from loopwright.pipeline.files import sha256
 from loopwright.pipeline.tracking.notes import experiment_note

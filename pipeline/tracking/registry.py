@@ -28,8 +28,8 @@ from loopwright.pipeline.tracking import card, signing
 from loopwright.pipeline.tracking.gate import Gate
 from loopwright.pipeline.tracking.signing import Signer
 from loopwright.pipeline.tracking.store import missing_file
+from loopwright.serving.controller_file import manifest_in, require_sidecar
 from loopwright.serving.errors import ArtifactError, SignatureError
-from loopwright.serving.sidecar import manifest_in, require_sidecar
 from loopwright.serving.words import harmless, plain
 
 CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"

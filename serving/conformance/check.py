@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.serving.conformance.kit import KIT, VECTORS
-from loopwright.serving.conformance.numbers import Array, read, read_all
+from loopwright.serving.conformance.kit import KIT, VECTORS, Array, read, read_all
 from loopwright.serving.errors import ContractError, LoopwrightError
 from loopwright.serving.words import plain
 

@@ -5,19 +5,44 @@ from __future__ import annotations
 import json
 import platform
 import shutil
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from loopwright.serving.conformance.numbers import written
 from loopwright.serving.conformance.scans import Scanned, scanned, start
 from loopwright.serving.conformance.steps import Answer, answered
 from loopwright.serving.controller import Controller, runtime_version
-from loopwright.serving.errors import LoopwrightError
+from loopwright.serving.controller_file import sidecar
+from loopwright.serving.errors import ContractError, LoopwrightError
 from loopwright.serving.guard import READ_BACK_MARGIN, InRange, Sample
-from loopwright.serving.sidecar import sidecar
 
+Array: TypeAlias = NDArray[np.float64]
+
+
+def written(values: Iterable[float]) -> list[str]:
+    """Each value as ``float.hex`` writes it: 0x1.8000000000000p+1, nan, inf, -inf."""
+    return [float(value).hex() for value in values]
+
+
+def read(texts: object, where: str) -> Array:
+    """The values (n,) that ``written`` wrote; ContractError names ``where`` if one is no such number."""
+    if not isinstance(texts, list):
+        raise ContractError(f"{where} is {str(texts)[:60]!r}; it must be a list of hexadecimal floats as text")
+    try:
+        return np.array([float.fromhex(text) for text in texts], dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ContractError(f"{where} holds no hexadecimal float: {error}") from error
+
+
+def read_all(row: Mapping[str, Any], where: str) -> dict[str, Array]:
+    """Each entry of ``row`` by ``read``."""
+    return {name: read(texts, f"{where}.{name}") for name, texts in row.items()}
+
+
+# ------------------------------------------------------------------------------------------------------------- the kit
 # Version of the format. 1 began its scans at an MV that was told, so it shows nothing of a start without one; up to 2
 # every command arrived, so it shows nothing of what follows one that did not.
 KIT = 3

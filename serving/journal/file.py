@@ -8,7 +8,7 @@ from contextlib import closing
 from pathlib import Path
 
 from loopwright.serving.errors import LoopError
-from loopwright.serving.file_lock import LockTakenError, locked
+from loopwright.serving.journal.file_lock import LockTakenError, locked
 
 SCHEMA = 2
 TABLES = """

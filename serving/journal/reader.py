@@ -14,9 +14,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.serving.journal.entries import Event, Scan
+from loopwright.serving.journal.entries import Event, Scan, table, unpacked
 from loopwright.serving.journal.file import opened
-from loopwright.serving.journal.packing import table, unpacked
 
 Array: TypeAlias = NDArray[np.float64]
 

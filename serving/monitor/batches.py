@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.monitor.answers import Answers
-from loopwright.serving.monitor.beside import ranges
-from loopwright.serving.monitor.chart import Chart
-from loopwright.serving.monitor.estimates import estimated
-from loopwright.serving.monitor.memory import ANY, COUNT, Kept, Remembers
-from loopwright.serving.monitor.pace import WEEK_S
+from loopwright.serving.monitor.cusum import Chart
+from loopwright.serving.monitor.learning import ANY, COUNT, WEEK_S, Kept, Remembers
+from loopwright.serving.monitor.local_approach import Answers
+from loopwright.serving.monitor.loop_statistics import estimated
+from loopwright.serving.monitor.prediction_error import ranges
 
 Array: TypeAlias = NDArray[np.float64]
 

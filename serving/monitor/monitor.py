@@ -13,23 +13,42 @@ from numpy.typing import NDArray
 from loopwright.serving.guard import Sample
 from loopwright.serving.loop import Command, Mode
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.monitor.answers import Answers
+from loopwright.serving.monitor.actuator_checks import AT_END, Following, Plight
 from loopwright.serving.monitor.batches import Batches
-from loopwright.serving.monitor.chart import Chart
-from loopwright.serving.monitor.error import Swing, harris_index
-from loopwright.serving.monitor.estimates import Estimates
-from loopwright.serving.monitor.following import Following
-from loopwright.serving.monitor.memory import TIME_S, number
-from loopwright.serving.monitor.numbers import numbers
-from loopwright.serving.monitor.pace import DAY_S, WEEK_S, blocks, dead_times, pooled, settle_scans
-from loopwright.serving.monitor.plight import AT_END, Plight
-from loopwright.serving.monitor.residual import Foresight
-from loopwright.serving.monitor.rest import RestMap
-from loopwright.serving.monitor.shares import Share
-from loopwright.serving.monitor.squares import log_mean_square
-from loopwright.serving.monitor.verdict import Verdict, failed
-from loopwright.serving.monitor.verdicts import verdicts
+from loopwright.serving.monitor.cusum import Chart
+from loopwright.serving.monitor.learning import DAY_S, TIME_S, WEEK_S, blocks, dead_times, number, pooled, settle_scans
+from loopwright.serving.monitor.local_approach import Answers
+from loopwright.serving.monitor.loop_statistics import Estimates, Share, Swing, harris_index
+from loopwright.serving.monitor.mv_at_rest import RestMap
+from loopwright.serving.monitor.prediction_error import Foresight, log_mean_square
+from loopwright.serving.monitor.verdicts import Verdict, failed, verdicts
 
+
+def numbers(m: Monitor) -> dict[str, float]:
+    """For those who draw it over months."""
+    found = {"saturated_share": m.saturated.value, "hold_share": m.hold.value}
+    if min(m.max_move) < inf:
+        found["rate_limited_share"] = m.limited.value
+    if m.domain is not None:
+        found["outside_domain_share"] = m.outside.value
+    for i, s in enumerate(m.manifest.sp):
+        found[f"mean_error_{s.name}"] = m.errors[i].value * float(s.high - s.low)
+        found[f"regularity_{s.name}"] = m.swings[i].regularity()
+        if m.harris[i].count:
+            found[f"harris_index_{s.name}"] = m.harris[i].value
+        seen = m.residual
+        if seen.chart.learnt if isinstance(seen, Foresight) else seen.sizes.learnt:
+            found[f"residual_ratio_{s.name}"] = seen.ratio(i)
+    if m.rest.learnt:
+        for i, s in enumerate(m.manifest.mv):
+            found[f"shift_at_rest_{s.name}"] = m.rest.chart.shift(i) * float(s.high - s.low)
+            gain = m.rest.gain(i)
+            if gain is not None:
+                found[f"gain_ratio_{s.name}"] = gain[0]
+    return {name: value for name, value in found.items() if isfinite(value)}
+
+
+# --------------------------------------------------------------------------------------------------------- the monitor
 Array: TypeAlias = NDArray[np.float64]
 
 LEARN_RESTS, LEARN_MODEL, LEARN_BLOCKS = 300, 20, 40  # periods of rest, blocks of the model, blocks of a chart

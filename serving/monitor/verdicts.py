@@ -17,21 +17,59 @@
 | a variable over a batch | its means over the eighths of the first batches (chart) |
 
 A chart is a CUSUM whose limit follows from the false alarms a week that are allowed: see
-``loopwright.serving.monitor.chart``.
+``loopwright.serving.monitor.cusum``.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+import numpy as np
+
+from loopwright.serving.manifest import Signal
 from loopwright.serving.monitor.batches import PARTS
-from loopwright.serving.monitor.residual import Foresight
-from loopwright.serving.monitor.squares import rms_ratio
-from loopwright.serving.monitor.verdict import Level, Verdict, failed, unit_of, unknown, when
+from loopwright.serving.monitor.prediction_error import Foresight, rms_ratio
 
 if TYPE_CHECKING:
     from loopwright.serving.monitor.monitor import Monitor
 
+Level: TypeAlias = Literal["as validated", "watch", "retrain", "not known yet"]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One plain line on one thing. ``value`` is what was measured and ``limit`` what it may be; None: not known."""
+
+    name: str
+    level: Level
+    text: str
+    value: float | None = None
+    limit: float | None = None
+
+
+def unknown(name: str, text: str) -> Verdict:
+    """Nothing can be said yet."""
+    return Verdict(name, "not known yet", text)
+
+
+def failed(trouble: str) -> Verdict:
+    """The monitor itself has an error."""
+    return Verdict("monitor", "watch", f"the monitor itself failed: {trouble}")
+
+
+def when(time_s: float | np.floating[Any]) -> str:
+    """A time [s since 1970] in UTC; the page writes what it finds in this form in the zone of its own clock."""
+    return datetime.fromtimestamp(float(time_s), UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def unit_of(s: Signal) -> str:
+    """The unit and a blank; nothing of a signal without one."""
+    return "" if s.unit == "-" else f"{s.unit} "
+
+
+# ------------------------------------------------------------------------------------------ the meaning of the figures
 MOST_HOLD = 0.02
 LEAST_SHARE, LEAST_OUTSIDE = 0.2, 0.1
 SWINGS = 1.0

@@ -15,7 +15,7 @@ from typing import NamedTuple
 from asyncua import ua
 
 from loopwright.serving.errors import EndpointError
-from loopwright.serving.fault import Fault
+from loopwright.serving.guard import Fault
 from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.opcua.answers import unanswered
 from loopwright.serving.opcua.link import Link, node_id

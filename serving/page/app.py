@@ -7,7 +7,7 @@ import hmac
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path, PurePath
 from typing import Any
@@ -20,15 +20,125 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from loopwright.serving.errors import LoopError, LoopwrightError
+from loopwright.serving.active_controller import require_fits
+from loopwright.serving.controller_file import file_digest, unseal
+from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
+from loopwright.serving.graph.audit import MAX_BYTES, audit
 from loopwright.serving.journal import JournalReader
-from loopwright.serving.page import metrics
+from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 from loopwright.serving.page.access import LONGEST_BODY, Access
-from loopwright.serving.page.candidates import candidates
 from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, shown
 from loopwright.serving.page.shared import Shared
 from loopwright.serving.page.trend import MOST_POINTS, trend
+from loopwright.serving.words import plain
 
+MOST = 50  # files that are looked at
+
+
+def candidates(
+    in_charge: Path, trusted: Sequence[str] | None = None, first: Path | None = None
+) -> list[dict[str, Any]]:
+    """Law, case, file, sha256 and signer of each controller beside the file ``in_charge`` that fits the loop.
+
+    The loop has the signals of the file ``first`` that it began with; without one, of the file in charge.
+
+    Where public keys are ``trusted``, only of files that one of them signed: the loop would refuse any other.
+    """
+    found: list[dict[str, Any]] = []
+    now, _, _ = _described(first or in_charge, trusted)
+    beside = (p for p in in_charge.parent.glob("*.onnx") if p.is_file())  # no pipe, which would never end
+    for path in sorted(beside)[:MOST]:
+        try:
+            manifest, sha256, signed = _described(path, trusted)
+            require_fits(manifest, now)
+        except (LoopwrightError, OSError, KeyError):
+            continue
+        if path.name != in_charge.name:
+            row = {"law": manifest.law, "case": manifest.case, "file": path.name, "sha256": sha256, "signed": signed}
+            found.append(row)
+    return found
+
+
+def _described(path: Path, trusted: Sequence[str] | None) -> tuple[Manifest, str, str | None]:
+    """Manifest, sha256 and signer, without a session; LoopwrightError where it is no controller, or not trusted."""
+    signed = None
+    if trusted is not None:
+        from loopwright.serving.signing.verify import verified  # here: it needs the package cryptography
+
+        signed = verified(path, trusted)
+    with path.open("rb") as file:
+        data = file.read(MAX_BYTES + 1)
+    sha256 = file_digest(data)
+    if signed is not None and sha256 != signed.sha256:
+        raise ArtifactError(f"{path} was exchanged after its signature was verified")
+    unseal(data)
+    return Manifest.from_json(audit(data).metadata[MANIFEST_KEY]), sha256, None if signed is None else signed.words
+
+
+# ----------------------------------------------------- the state of a loop as Prometheus text, exposition format 0.0.4
+MODES = ("SHADOW", "MANUAL", "AUTO", "HOLD")
+LEVELS = {"not known yet": -1, "as validated": 0, "watch": 1, "retrain": 2}
+GROUPS = (
+    ("setpoint", "sp", "sp", "Set point, in the signal's unit."),
+    ("process_variable", "pv", "pv", "Process variable, in the signal's unit."),
+    ("manipulated_variable", "mv", "mv", "Manipulated variable that the loop asks for; none in SHADOW."),
+    ("applied", "applied", "mv", "Manipulated variable that the actuator has."),
+    ("law", "law", "mv", "Manipulated variable that the law wants."),
+)
+
+
+def metrics_text(about: Mapping[str, Any], state: Mapping[str, Any]) -> str:
+    """One gauge or counter a line, each family with its help."""
+    lines: list[str] = []
+    for name, kind, words, rows in _families(about, state):
+        lines += [f"# HELP loopwright_{name} {words}", f"# TYPE loopwright_{name} {kind}"]
+        lines += [f"loopwright_{name}{_labels(labels)} {float(value)!r}" for labels, value in rows if value is not None]
+    return "\n".join(lines) + "\n"
+
+
+def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tuple[str, str, str, Iterable[Any]]]:
+    none: Mapping[str, str] = {}
+    card = about["card"]
+    info = {"law": card["law"], "case": card["case"], "sha256": card["sha256"], "file": card["file"]}
+    yield "controller_info", "gauge", "The controller in charge.", [(info, 1)]
+    yield "up", "gauge", "1 while the loop scans.", [(none, int(state["alive"]))]
+    yield "mode", "gauge", "1 for the present mode.", [({"mode": m}, int(m == state["mode"])) for m in MODES]
+    for name, words in (
+        ("scans", "Scans since the loop's start."),
+        ("missed", "Periods without a scan, because the machine was late."),
+        ("faults", "Scans with a fault."),
+        ("connections", "Connections that were made to the plant's server."),
+    ):
+        value = state.get({"scans": "scan"}.get(name, name))
+        yield f"{name}_total", "counter", words, [(none, value)]
+    yield "last_scan_seconds", "gauge", "Time of the last scan, since 1970.", [(none, state["time"])]
+    yield "journal_ok", "gauge", "1 while the journal can be written.", [(none, int(not state.get("journal")))]
+    lost = "Scans and events that the journal has lost, or never got because the disk took none."
+    yield "journal_lost_total", "counter", lost, [(none, state.get("journal_lost"))]
+    for name, key, group, words in GROUPS:
+        signals = about["signals"][group]
+        values = state.get(key) or [None] * len(signals)
+        rows = [({"signal": s["name"], "unit": s["unit"]}, v) for s, v in zip(signals, values, strict=False)]
+        yield name, "gauge", words, rows
+    infos = zip(about["info"], state.get("info") or [], strict=False)
+    yield "info", "gauge", "What the law tells of itself.", [({"name": name}, v) for name, v in infos]
+    numbers = state.get("numbers") or {}
+    yield "monitor", "gauge", "What the monitor has measured.", [({"name": n}, v) for n, v in numbers.items()]
+    verdicts = state.get("verdicts") or []
+    levels = [({"name": v["name"]}, LEVELS[v["level"]]) for v in verdicts if v["level"] in LEVELS]
+    words = "Is the controller still right? 0 as validated, 1 watch, 2 retrain, -1 not known yet."
+    yield "verdict", "gauge", words, levels
+
+
+def _labels(labels: Mapping[str, Any]) -> str:
+    """Labels in braces, with what the format forbids in a value escaped."""
+    if not labels:
+        return ""
+    escaped = {k: plain(str(v)).replace("\\", r"\\").replace('"', r"\"") for k, v in labels.items()}
+    return "{" + ",".join(f'{k}="{v}"' for k, v in escaped.items()) + "}"
+
+
+# ------------------------------------------------------------------------------------------------------------ the page
 STATIC = Path(__file__).parent / "static"
 BODY_S = 5.0  # in which the body of a change must be here
 LONGEST_SPAN_S = 400 * 86_400.0
@@ -180,7 +290,7 @@ class PageApp:
     async def metrics(self, _: Request) -> Response:
         """For Prometheus."""
         about, state = await self._about(), await self.live.state()
-        return PlainTextResponse(metrics.text(about, state), media_type="text/plain; version=0.0.4")
+        return PlainTextResponse(metrics_text(about, state), media_type="text/plain; version=0.0.4")
 
     async def healthz(self, _: Request) -> Response:
         """200 while the loop scans, else 503."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from loopwright.serving.errors import LoopError
-from loopwright.serving.own_process import module
+from loopwright.serving.first_steps import module
 from loopwright.serving.page.settings import Page
 
 START_S = 20.0

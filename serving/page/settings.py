@@ -3,11 +3,37 @@
 from __future__ import annotations
 
 import ipaddress
+import socket
+import ssl
 from dataclasses import dataclass
 from pathlib import Path
 
 from loopwright.serving.errors import LoopError
+from loopwright.serving.words import named
 
+
+def listening(page: Page) -> socket.socket:
+    """A socket that listens where the page is to be. LoopError where it cannot."""
+    host, port = page.address
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family, backlog=128)
+    except OSError as error:
+        raise LoopError(f"the page cannot listen at {page.listen}: {error.strerror or error}") from None
+
+
+def require_usable(page: Page) -> None:
+    """LoopError where the page's certificate or key cannot be used."""
+    if page.certificate is None:
+        return
+    try:
+        # A key that is locked by a password would be asked for at the terminal.
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(page.certificate, page.private_key, lambda: "")
+    except OSError as error:  # ssl.SSLError too
+        raise LoopError(f"the page's certificate or key cannot be used: {named(error)}") from None
+
+
+# ------------------------------------------------------------------------------------------------------------ settings
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 

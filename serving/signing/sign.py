@@ -8,10 +8,9 @@ from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
 
-from loopwright.serving import graph_audit
-from loopwright.serving.digest import file_digest
+from loopwright.serving.controller_file import difference, file_digest, manifest_in
 from loopwright.serving.errors import ArtifactError, SignatureError
-from loopwright.serving.sidecar import difference, manifest_in
+from loopwright.serving.graph import audit
 from loopwright.serving.signing import bundle
 from loopwright.serving.signing.keys import PrivateKey
 from loopwright.serving.signing.reading import contents
@@ -45,7 +44,7 @@ def sign(
 def _files(path: Path) -> dict[str, str]:
     """Name -> SHA-256 of the controller's file and of its manifest's JSON file, where there is one."""
     try:
-        data = contents(path, graph_audit.MAX_BYTES)
+        data = contents(path, audit.MAX_BYTES)
     except FileNotFoundError:
         raise SignatureError(f"{path} does not exist; give a controller's .onnx file") from None
     try:

@@ -9,9 +9,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from loopwright.serving import graph_audit
-from loopwright.serving.digest import file_digest
+from loopwright.serving.controller_file import file_digest
 from loopwright.serving.errors import SignatureError
+from loopwright.serving.graph import audit
 from loopwright.serving.signing import bundle
 from loopwright.serving.signing.keys import PublicKey
 from loopwright.serving.signing.reading import contents
@@ -160,7 +160,7 @@ def _unchanged(path: Path, statement: Statement) -> str:
         named = ", ".join(sorted(statement.files))[:200]
         raise SignatureError(f"its signature is that of another file ({named}); a signed file keeps its name")
     sidecar = path.with_suffix(".json")
-    for file, most in ((path, graph_audit.MAX_BYTES), (sidecar, MAX_SIDECAR)):
+    for file, most in ((path, audit.MAX_BYTES), (sidecar, MAX_SIDECAR)):
         wanted = statement.files.get(file.name)
         try:
             data = contents(file, most)

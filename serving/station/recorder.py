@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
-from loopwright.serving.fault import kind_of, lasting
-from loopwright.serving.guard import Sample
+from loopwright.serving.guard import Sample, kind_of, lasting
 from loopwright.serving.journal import Event, Journal, JournalReader, Scan
 from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import Command, ControlLoop, Mode

@@ -28,7 +28,15 @@ from loopwright.serving.opcua.nameplates import Identity, others_since
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.page.process import PageProcess
 from loopwright.serving.proof import judged
-from loopwright.serving.station.beginning import (
+from loopwright.serving.station.build_loop import control_loop
+from loopwright.serving.station.control import Answer, Control
+from loopwright.serving.station.housekeeping import Said, Tending
+from loopwright.serving.station.lease import Lease, Locks
+from loopwright.serving.station.monitor_runner import Watching
+from loopwright.serving.station.recorder import Recorder
+from loopwright.serving.station.requests import Change, Request, Wishes, change, require_proven
+from loopwright.serving.station.settings import Settings
+from loopwright.serving.station.startup import (
     another_before,
     begun_at,
     keep_namespaces,
@@ -38,18 +46,7 @@ from loopwright.serving.station.beginning import (
     nodes_before,
     usable,
 )
-from loopwright.serving.station.control import Answer, Control
-from loopwright.serving.station.lease import Lease
-from loopwright.serving.station.locks import Locks
-from loopwright.serving.station.making import control_loop
-from loopwright.serving.station.recorder import Recorder
-from loopwright.serving.station.requests import Change, Request, change, require_proven
-from loopwright.serving.station.said import Said
-from loopwright.serving.station.settings import Settings
-from loopwright.serving.station.tending import Tending
 from loopwright.serving.station.views import about, picture, state
-from loopwright.serving.station.watching import Watching
-from loopwright.serving.station.wishes import Wishes
 from loopwright.serving.trust import Controller as TrustedController
 from loopwright.serving.trust import ending, signer
 from loopwright.serving.words import first_line

@@ -10,10 +10,10 @@ import yaml
 from identified_models import scaled_model
 from own_cases import GAINS, POLES, case_of, loop_of, section, two_lags
 
+from loopwright.pipeline.cases.operating_range import visited_mv
 from loopwright.pipeline.cases.own_plant import OwnCase, own_case
-from loopwright.pipeline.cases.reach import visited_mv
 from loopwright.pipeline.errors import ParamsError
-from loopwright.pipeline.evaluation.reached import beyond
+from loopwright.pipeline.evaluation.extrapolation import beyond
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.models.base import load_model
 from loopwright.pipeline.optimal.sampled import SampledHorizon, run_sampled

@@ -10,9 +10,9 @@ import pytest
 from identified_models import scaled_model
 from own_cases import case_of, loop_of, section
 
-from loopwright.pipeline.cases.daily_work import LEAST, MOST, day, spread, windows
 from loopwright.pipeline.cases.own_model import OwnPlant
 from loopwright.pipeline.cases.own_plant import DAILY, OwnCase
+from loopwright.pipeline.cases.own_tests import LEAST, MOST, day, spread, windows
 from loopwright.pipeline.evaluation.trials import Trials
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.metrics import mae

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from own_cases import controllers_of_a_lag
 
-from loopwright.pipeline.cases.loads import ABOVE_NOISE, LEAST_LOAD, LOAD, held_load, load_size, whole_load
+from loopwright.pipeline.cases.operating_range import SCALES, Reach, held_at
 from loopwright.pipeline.cases.own_plant import GATE
-from loopwright.pipeline.cases.reach import SCALES, Reach, held_at
+from loopwright.pipeline.cases.own_tests import ABOVE_NOISE, LEAST_LOAD, LOAD, held_load, load_size, whole_load
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.simulation.rests import courses
@@ -27,7 +27,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def wanted_load(reach: Reach, monkeypatch: pytest.MonkeyPatch) -> float:
     """The load before anything is asked of the MVs."""
     with monkeypatch.context() as patch:
-        patch.setattr("loopwright.pipeline.cases.reach.can_command", lambda *_: True)
+        patch.setattr("loopwright.pipeline.cases.operating_range.can_command", lambda *_: True)
         found = held_load(reach, reach.model, 0)
     assert found is not None
     return found
@@ -92,7 +92,7 @@ def test_a_small_room_gives_the_load_that_fits_it(monkeypatch: pytest.MonkeyPatc
     def can_command(_: object, values: np.ndarray, room: float = 0.0) -> bool:
         return room == 0.0 or rest - 1e-9 <= values[0] <= edge
 
-    monkeypatch.setattr("loopwright.pipeline.cases.reach.can_command", can_command)
+    monkeypatch.setattr("loopwright.pipeline.cases.operating_range.can_command", can_command)
     found = held_load(reach, reach.model, 0, upwards=False)
     assert found is not None
     assert LEAST_LOAD <= -found / wanted <= 0.05 < SCALES[-1]

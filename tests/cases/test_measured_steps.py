@@ -13,10 +13,10 @@ import torch
 from identified_models import first_order
 from own_cases import case_of, section
 
-from loopwright.pipeline.cases.measured_steps import ROOM
 from loopwright.pipeline.cases.own_plant import GATE, LOAD_AT, MEASURED, OwnCase
+from loopwright.pipeline.cases.own_tests import ROOM
 from loopwright.pipeline.errors import ParamsError, PlantError
-from loopwright.pipeline.evaluation.trial import close_loop
+from loopwright.pipeline.evaluation.trials import close_loop
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models import load_model
 from loopwright.pipeline.optimal.sampled import SampledHorizon, run_sampled

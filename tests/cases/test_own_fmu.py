@@ -14,8 +14,8 @@ from fmu_parts import EXAMPLE, FMI_2, fmu
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.cases.own_simulator import SimulatedCase
-from loopwright.pipeline.commands.new_fmu import MISSING, proposals, table_from
-from loopwright.pipeline.commands.new_simulated import SLOW, WANTED, simulated
+from loopwright.pipeline.commands.own_plant.fmu_variables import MISSING, proposals, table_from
+from loopwright.pipeline.commands.own_plant.from_simulator import SLOW, WANTED, simulated
 from loopwright.pipeline.excitation.first_test import first_test
 from loopwright.pipeline.files import sha256
 from loopwright.pipeline.historian.cleaning.tags import Tag

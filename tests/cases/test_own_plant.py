@@ -11,15 +11,15 @@ import pytest
 import yaml
 
 from loopwright.pipeline.cases import CASES, all_cases
-from loopwright.pipeline.cases.loads import LOAD
 from loopwright.pipeline.cases.own_model import LEAST_GAIN, Doubts, OwnPlant
 from loopwright.pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
+from loopwright.pipeline.cases.own_tests import LOAD
 from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.assembly import remembering
 from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.plants.perturbed import SpoiltPlant
 from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.spoilt import SpoiltPlant
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.simulate import noise_draws, simulate_closed
 from loopwright.pipeline.tuning.responses import StepResponses

@@ -12,9 +12,9 @@ import yaml
 
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import all_cases
-from loopwright.pipeline.cases.loads import LOAD
 from loopwright.pipeline.cases.own_model import OwnPlant
 from loopwright.pipeline.cases.own_simulator import SimulatedCase
+from loopwright.pipeline.cases.own_tests import LOAD
 from loopwright.pipeline.plants.simulator_file import FileSimulator
 from loopwright.pipeline.simulation.simulate import simulate_closed
 from loopwright.pipeline.stages.check import mistakes

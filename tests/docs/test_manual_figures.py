@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from pages import DOCS, PAGES, ROOT
 
+from loopwright.serving.monitor.learning import blocks, pooled
 from loopwright.serving.monitor.monitor import BLOCK, LEARN_BLOCKS, LEARN_MODEL, LEARN_RESTS
-from loopwright.serving.monitor.pace import blocks, pooled
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from loopwright.pipeline.engine.bars import Bars
+from loopwright.pipeline.engine.capture_output import BARS, MARK
+from loopwright.pipeline.engine.dvc_output import Bars
 from loopwright.pipeline.engine.progress import Lines, Piece
-from loopwright.pipeline.engine.spoken import BARS, MARK
 
 
 def drawn(terminal: bool) -> tuple[Bars, io.StringIO]:
@@ -63,7 +63,7 @@ bars = os.environ.get({BARS!r})
 print({MARK + told!r} if bars else "fit a: networks: 50 % done", file=sys.stderr, flush=True)
 print("fit a: done", flush=True)
 """)
-    command = [sys.executable, "-m", "loopwright.pipeline.engine.lanes", "--of", "fit@a", "repro"]
+    command = [sys.executable, "-m", "loopwright.pipeline.engine.parallel_dvc", "--of", "fit@a", "repro"]
     environment = {
         **os.environ,
         "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(__file__).parents[2]}/tools/roots",

@@ -64,7 +64,7 @@ def folder(tmp_path: Path) -> Path:
 def begin(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     environment: Mapping[str, str] = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}/tools/roots"}
     pipe = subprocess.PIPE
-    command = [sys.executable, "-m", "loopwright.pipeline.engine.lanes", *arguments]
+    command = [sys.executable, "-m", "loopwright.pipeline.engine.parallel_dvc", *arguments]
     return subprocess.Popen(command, cwd=folder, env=environment, stdout=pipe, stderr=pipe, text=True)
 
 

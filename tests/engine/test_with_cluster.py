@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from processes import lives, within
 
-from loopwright.pipeline.engine.lifeline import hear_no_interrupt
+from loopwright.pipeline.engine.parent_death import hear_no_interrupt
 
 ROOT = Path(__file__).parents[2]
 PROBE = """
@@ -28,7 +28,15 @@ from threading import Event
 Path("pid").write_text(str(os.getpid()))
 Event().wait(60)
 """
-FILES = ("__init__.py", "start.py", "with_cluster.py", "lifeline.py", "outlet.py", "cluster.py", "stage_files.py")
+FILES = (
+    "__init__.py",
+    "start.py",
+    "with_cluster.py",
+    "parent_death.py",
+    "stderr_filter.py",
+    "cluster.py",
+    "stage_files.py",
+)
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a process does not end with its parent")
 

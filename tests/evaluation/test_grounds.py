@@ -10,8 +10,8 @@ import pytest
 from own_cases import two_lags
 
 from loopwright.pipeline.cases import CASES
-from loopwright.pipeline.evaluation.grounds import Grounds, RecordVerdict
-from loopwright.pipeline.evaluation.reached import beyond, grounds_of, reached_by, widest
+from loopwright.pipeline.evaluation.evidence_basis import Grounds, RecordVerdict
+from loopwright.pipeline.evaluation.extrapolation import beyond, grounds_of, reached_by, widest
 from loopwright.pipeline.simulation.simulate import simulate_closed
 
 RECORDED = {"T": (20.0, 60.0), "V": (0.0, 10.0)}

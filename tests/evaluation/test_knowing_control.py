@@ -14,7 +14,7 @@ from loopwright.pipeline.cases import own_plant
 from loopwright.pipeline.cases.own_model import lessened
 from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.evaluation.knowing_control import gets_there, reached
-from loopwright.pipeline.evaluation.trial import close_loop, repeated, seized
+from loopwright.pipeline.evaluation.trials import close_loop, repeated, seized
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.simulation.scenario import Scenario, held
 
@@ -143,9 +143,9 @@ def test_set_points_say_whether_the_plant_rests_at_each(monkeypatch: pytest.Monk
     assert rests
     assert np.array_equal(sp, case.reach.set_points(member, 9001))
     monkeypatch.setattr(
-        "loopwright.pipeline.cases.reach.inside", lambda values, *_: np.zeros(values.shape[:-1], dtype=bool)
+        "loopwright.pipeline.cases.operating_range.inside", lambda values, *_: np.zeros(values.shape[:-1], dtype=bool)
     )
-    monkeypatch.setattr("loopwright.pipeline.cases.reach.held_at", lambda *_: None)
+    monkeypatch.setattr("loopwright.pipeline.cases.operating_range.held_at", lambda *_: None)
     sp, rests = case.reach.drawn(member, 9001)
     assert not rests
     assert np.ptp(sp) == 0

@@ -11,9 +11,9 @@ import pytest
 from own_cases import controllers_of_a_lag, two_lags
 from rich.console import Console
 
-from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.evidence_basis import Grounds
+from loopwright.pipeline.evaluation.extrapolation import grounds_of
 from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, statements
-from loopwright.pipeline.evaluation.reached import grounds_of
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.report.results import show_results
 from loopwright.pipeline.stages.design import design

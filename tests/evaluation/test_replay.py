@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.evaluation.replay import UNSEEN, replay
+from loopwright.pipeline.evaluation.open_loop import UNSEEN, replay
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.errors import LoopwrightError

@@ -19,12 +19,11 @@ from loopwright.pipeline.engine.cluster import connected, local_cluster
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.evaluation.stress.draws import LATE, NOISE, Draw, Drawing
 from loopwright.pipeline.evaluation.stress.faults import KINDS, Actuators
-from loopwright.pipeline.evaluation.stress.loops import Stress, swings
+from loopwright.pipeline.evaluation.stress.loops import Stress, advance_rows, swings
 from loopwright.pipeline.evaluation.stress.summary import Summary, table
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from loopwright.pipeline.plants.side_by_side import advance_rows
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.serving import Controller, LoopwrightError, Signal
 

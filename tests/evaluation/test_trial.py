@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.cases import CASES
-from loopwright.pipeline.evaluation import trial, trials
+from loopwright.pipeline.evaluation import trials
 from loopwright.pipeline.evaluation.case import Case, Curve, Figure
-from loopwright.pipeline.evaluation.trial import DRAW, close_loop, repeated, seized, swings_on
-from loopwright.pipeline.evaluation.trials import try_files
+from loopwright.pipeline.evaluation.trials import DRAW, close_loop, repeated, seized, swings_on, try_files
 from loopwright.serving.errors import OutputError
 
 
@@ -127,7 +126,7 @@ def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: p
     # The development is judged by the case's metric, under the noise that the plant always has.
     controller: Any = Proportional()
     tests = case.development()
-    rows = [repeated(controller, case, t, True, trial.DEVELOPMENT + i) for i, t in enumerate(tests)]
+    rows = [repeated(controller, case, t, True, trials.DEVELOPMENT + i) for i, t in enumerate(tests)]
     assert base.development == pytest.approx(np.mean([row.metrics["sse"] for row in rows]))
     # Infos are those of the manifest, without the mark of a refused step.
     assert base.info == ("error", "steps")

@@ -12,7 +12,7 @@ import pytest
 
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.evaluation.law_evidence import Analysis, lock_up_text
-from loopwright.pipeline.evaluation.standing import Standing
+from loopwright.pipeline.evaluation.leaderboard import Standing
 from loopwright.pipeline.evaluation.validation import (
     FILE,
     SCHEMA,

@@ -24,7 +24,7 @@ from loopwright.pipeline.laws import ControlLaw
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving import Controller, Signal
 from loopwright.serving.conformance.steps import answered
-from loopwright.serving.digest import TRAILER_BYTES, file_digest
+from loopwright.serving.controller_file import TRAILER_BYTES, file_digest
 
 pytest_plugins = ["small_laws"]
 MakeFormula = Callable[..., ControlLaw]

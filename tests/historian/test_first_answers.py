@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from dirty_plant import PERIOD_S, Clean, clean, screen_of, steps
 
-from loopwright.pipeline.commands.new_printed import sayings
+from loopwright.pipeline.commands.own_plant.printed import sayings
 from loopwright.pipeline.historian.answers import first_answer
 from loopwright.pipeline.historian.cleaning.findings import Verdict
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from dirty_plant import Clean, screen_of, steps
 
-from loopwright.pipeline.commands.new_printed import sayings
+from loopwright.pipeline.commands.own_plant.printed import sayings
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.screening import Screened
 

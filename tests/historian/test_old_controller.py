@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.old_loops import old_controllers
-from loopwright.pipeline.records.old_controller import OldController
+from loopwright.pipeline.records.old_loops import OldController
 
 H = 10.0  # s
 TAGS = (

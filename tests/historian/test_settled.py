@@ -10,7 +10,7 @@ import pytest
 from dirty_plant import PERIOD_S, START_S, Clean, clean, screen_of
 from scipy.signal import lfilter
 
-from loopwright.pipeline.commands.new_printed import sayings
+from loopwright.pipeline.commands.own_plant.printed import sayings
 from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.historian import settling
 from loopwright.pipeline.historian.cleaning.findings import Finding, InputReport

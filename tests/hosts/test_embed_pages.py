@@ -13,7 +13,7 @@ from kits import EMBED, ROOT, SHIPPED, kit_of
 
 from loopwright.serving import Controller
 from loopwright.serving.conformance.kit import VECTORS
-from loopwright.serving.graph_audit import audit
+from loopwright.serving.graph.audit import audit
 
 PLC = (EMBED / "plc" / "README.md").read_text()
 DOCS = (ROOT / "docs" / "embedding.md").read_text()

@@ -11,7 +11,7 @@ from quick_laws import plant_of
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws import LAWS
-from loopwright.pipeline.laws.fitting import require_fit
+from loopwright.pipeline.laws.suitability import require_fit
 from loopwright.pipeline.models import Model
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 

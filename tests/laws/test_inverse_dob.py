@@ -9,9 +9,8 @@ from shipped import required
 from torch import Tensor
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob, ObserverLaw
+from loopwright.pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob, ObserverLaw, candidates
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.static.candidates import candidates
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving.manifest import Signal
 

@@ -17,7 +17,7 @@ from loopwright.pipeline.export.graph import law_graph
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.laws.gain_update import gain_update
 from loopwright.pipeline.laws.linearized.linearized_pid import LinearizedPid
-from loopwright.pipeline.laws.ranges import in_units
+from loopwright.pipeline.laws.scaled_defaults import in_units
 from loopwright.pipeline.models.lagged.instantaneous import linearize
 from loopwright.pipeline.models.lagged.nnarx import NNARX
 

@@ -13,9 +13,9 @@ from shipped import required
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws import LAWS, ControlLaw
-from loopwright.pipeline.laws.fitting import require_fit
 from loopwright.pipeline.laws.inverse.inverse_dob import ObserverLaw
 from loopwright.pipeline.laws.inverse.self_chosen import CALM, CLEAR, Choice, linearized
+from loopwright.pipeline.laws.suitability import require_fit
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from loopwright.pipeline.plants.signals import Signals

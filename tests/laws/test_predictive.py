@@ -16,9 +16,10 @@ from torch import Tensor
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws.predictive.disturbance_model import Where, loads_of
 from loopwright.pipeline.laws.predictive.horizon import horizon_of
-from loopwright.pipeline.laws.predictive.loads import Where, loads_of
-from loopwright.pipeline.laws.predictive.moves import Moves
+from loopwright.pipeline.laws.predictive.horizon_check import horizon_for, settling_times, step_responses
+from loopwright.pipeline.laws.predictive.move_blocking import Moves
 from loopwright.pipeline.laws.predictive.observer import (
     BOOST,
     CALMING,
@@ -33,12 +34,10 @@ from loopwright.pipeline.laws.predictive.observer import (
     Observer,
     load_variance,
 )
-from loopwright.pipeline.laws.predictive.plan import Cost, Planner
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.settling import horizon_for, settling_times, step_responses
-from loopwright.pipeline.laws.predictive.side_by_side import side_by_side
-from loopwright.pipeline.laws.predictive.trials import LOOPS, Outcome, Trials, _late
+from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
 from loopwright.pipeline.laws.predictive.tuning import FORGETS, TRAVEL, Candidate, calmest, judged, searched, tuned
+from loopwright.pipeline.laws.predictive.tuning_loops import LOOPS, Outcome, Trials, _late, side_by_side
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.serving import Controller

@@ -9,7 +9,7 @@ from identified_models import random_model, scaled_model
 from predictive_loops import NONE, law_of
 from torch import Tensor
 
-from loopwright.pipeline.laws.predictive.loads import Where, held_rest, loads_of
+from loopwright.pipeline.laws.predictive.disturbance_model import Where, held_rest, loads_of
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models.identified.identified import Identified
 

@@ -12,13 +12,13 @@ from scipy.optimize import brentq
 
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
+from loopwright.pipeline.laws.predictive.disturbance_model import loads_of
 from loopwright.pipeline.laws.predictive.horizon import horizon_of
-from loopwright.pipeline.laws.predictive.loads import loads_of
-from loopwright.pipeline.laws.predictive.moves import Moves
+from loopwright.pipeline.laws.predictive.move_blocking import Moves
 from loopwright.pipeline.laws.predictive.params import PredictiveParams, limits_of
-from loopwright.pipeline.laws.predictive.plan import Cost, Planner
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.soft_limits import EPS, PRICE, SOFT, SoftLimits
+from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
+from loopwright.pipeline.laws.predictive.set_points import EPS, PRICE, SOFT, SoftLimits
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.equations import EquationPlant
 

@@ -7,9 +7,8 @@ import pytest
 from identified_models import first_order, made_signals
 
 from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.predictive.horizon_check import AFTER, Sight
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.settling import AFTER
-from loopwright.pipeline.laws.predictive.sight import Sight
 
 
 def designed(pole: float, dead: int, horizon: int | None = None) -> Predictive:

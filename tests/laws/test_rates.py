@@ -16,7 +16,7 @@ from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.rates import Rates, rates_of
+from loopwright.pipeline.laws.rate_limits import Rates, rates_of
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving.card import card
 from loopwright.serving.controller import Controller

@@ -15,7 +15,7 @@ from quick_laws import CALM, FORMS, QUICK, plant_of, quick_parts, rest_points
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.laws import LAWS, ControlLaw
-from loopwright.pipeline.laws.ranges import OfRange
+from loopwright.pipeline.laws.scaled_defaults import OfRange
 from loopwright.pipeline.models import Model
 from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
 from loopwright.pipeline.models.local.local_models import LocalModels

@@ -8,7 +8,7 @@ import pytest
 from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.old_loops import old_controllers, operated
-from loopwright.pipeline.records.operated import operation
+from loopwright.pipeline.records.old_loops import operation
 
 SP = np.array([10.0, 10.0, 10.0, 12.0, 12.0, 12.0])
 PV = np.array([10.0, 11.0, 10.0, 10.0, 11.0, 12.0])

@@ -16,7 +16,7 @@ from chromium import CHROMIUM, come_in
 from fake_loop import BEGIN, FakeLoop
 
 from loopwright.serving.journal import Event
-from loopwright.serving.monitor.verdict import when
+from loopwright.serving.monitor.verdicts import when
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)

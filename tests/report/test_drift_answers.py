@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from own_cases import two_lags
 
-from loopwright.pipeline.report.drift import FOLLOWED, GONE, LEFT, drift_answers
+from loopwright.pipeline.report.identified_model import FOLLOWED, GONE, LEFT, drift_answers
 
 ROWS = 400
 SAID = "The screening said of y1: it wanders: what the inputs do not explain moves over 27 % of its span. "

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.errors import PipelineError
-from loopwright.pipeline.evaluation.standing import Standing, tally
+from loopwright.pipeline.evaluation.leaderboard import Standing, tally
 from loopwright.pipeline.evaluation.validation import SCHEMA
 from loopwright.pipeline.report import templating
 from loopwright.pipeline.report.overview import write_overview

@@ -21,7 +21,7 @@ from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.errors import ReportError
 from loopwright.pipeline.evaluation.case import Curve, PaperFigure, Requirement
 from loopwright.pipeline.evaluation.evidence import Evidence
-from loopwright.pipeline.evaluation.grounds import Grounds
+from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.verdicts import PLAIN, close
 from loopwright.pipeline.optimal import bounds
 from loopwright.pipeline.report.page import context

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from loopwright.pipeline.evaluation.standing import Standing
+from loopwright.pipeline.evaluation.leaderboard import Standing
 from loopwright.pipeline.report.results import AHEAD, show_results
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"

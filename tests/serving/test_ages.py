@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from loopwright.serving.opcua.ages import Ages
+from loopwright.serving.opcua.sampling import Ages
 
 OFFSETS = [0.0, 3600.0, -3600.0, 1e9]
 

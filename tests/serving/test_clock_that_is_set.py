@@ -14,7 +14,7 @@ import pytest
 from loopwright.serving import Controller
 from loopwright.serving.journal import Journal, JournalReader, Scan, columns
 from loopwright.serving.page.trend import trend
-from loopwright.serving.station.export import export
+from loopwright.serving.station.journal_export import export
 
 pytest_plugins = ["small_laws"]
 

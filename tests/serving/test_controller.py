@@ -27,10 +27,11 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from loopwright.pipeline.laws import ControlLaw
-from loopwright.serving import ArtifactError, ContractError, Controller, Manifest, SampleError, Signal, step_lock
-from loopwright.serving.digest import TRAILER_BYTES, seal
+from loopwright.serving import ArtifactError, ContractError, Controller, Manifest, SampleError, Signal
+from loopwright.serving import controller as controller_module
+from loopwright.serving.controller_file import TRAILER_BYTES, seal
 from loopwright.serving.errors import OutputError
-from loopwright.serving.graph_audit import audit
+from loopwright.serving.graph.audit import audit
 from loopwright.serving.manifest import MANIFEST_KEY
 
 pytest_plugins = ["small_laws"]
@@ -117,14 +118,14 @@ def test_a_forked_child_does_not_wait_for_a_step_of_another_thread(
     controller: Controller, monkeypatch: pytest.MonkeyPatch, ends: bool
 ) -> None:
     """The thread that steps is none of the child's: it would never release the lock there."""
-    monkeypatch.setattr(step_lock, "LONGEST_STEP_S", 60.0 if ends else 0.0)
+    monkeypatch.setattr(controller_module, "LONGEST_STEP_S", 60.0 if ends else 0.0)
     stepping, forking = threading.Event(), threading.Event()
 
     def step() -> None:
         with controller._lock:
             stepping.set()
             if ends:
-                while not step_lock._forking.locked():
+                while not controller_module._forking.locked():
                     pass
             else:
                 forking.wait()
@@ -140,7 +141,7 @@ def test_a_forked_child_does_not_wait_for_a_step_of_another_thread(
     thread.join()
     assert os.waitpid(child, 0)[1] == 0
     assert not controller._lock.locked()
-    assert not step_lock._forking.locked()
+    assert not controller_module._forking.locked()
     controller.step(**FEED)
 
 

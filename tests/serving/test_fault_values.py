@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from loopwright.serving import Controller, ControlLoop, EndpointError, Fresh, InRange, Mode, Rate, Sample, Signal
-from loopwright.serving.fault import Fault, kind_of, lasting, reworded, told_by
+from loopwright.serving.guard import Fault, kind_of, lasting, reworded, told_by
 from loopwright.serving.journal import Journal
 from loopwright.serving.station.recorder import Recorder
 

@@ -25,7 +25,7 @@ from loopwright.serving import (
     Signal,
     default_guards,
 )
-from loopwright.serving.fitted import Fitted, fitted
+from loopwright.serving.active_controller import Fitted, fitted
 from loopwright.serving.journal import columns
 from loopwright.serving.trust import signer
 

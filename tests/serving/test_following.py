@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.serving import Controller, ControlLoop, Mode, Sample, Signal
 from loopwright.serving.monitor import Monitor
-from loopwright.serving.monitor.following import Following
+from loopwright.serving.monitor.actuator_checks import Following
 
 pytest_plugins = ["small_laws"]
 

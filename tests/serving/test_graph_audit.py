@@ -18,10 +18,10 @@ from onnx import TensorProto, helper, numpy_helper
 from shipped_files import SHIPPED
 
 from loopwright.serving import ArtifactError
-from loopwright.serving.graph_audit import MAX_NODES, MAX_OPSET, MIN_OPSET, audit, graph_values
-from loopwright.serving.graph_operators import SIGNATURES
-from loopwright.serving.graph_work import MAX_WORK, RULES
-from loopwright.serving.onnx_bytes import SCHEMA, read_model
+from loopwright.serving.graph.audit import MAX_NODES, MAX_OPSET, MIN_OPSET, audit, graph_values
+from loopwright.serving.graph.onnx_bytes import SCHEMA, read_model
+from loopwright.serving.graph.operators import SIGNATURES
+from loopwright.serving.graph.work import MAX_WORK, RULES
 
 by_name = pytest.mark.parametrize("file", SHIPPED, ids=lambda file: f"{file.parent.name}-{file.stem}")
 

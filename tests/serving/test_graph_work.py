@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from loopwright.serving.graph_work import BOOL, DOUBLE, INT64, MAX_RANK, Node, Value, results
+from loopwright.serving.graph.work import BOOL, DOUBLE, INT64, MAX_RANK, Node, Value, results
 
 
 def tensor(*shape: int, dtype: int = DOUBLE) -> Value:

@@ -24,7 +24,7 @@ from loopwright.serving import (
     Signal,
     default_guards,
 )
-from loopwright.serving.fault import lasting
+from loopwright.serving.guard import lasting
 
 PV = (Signal("level", "m", 0.0, 2.0), Signal("T", "K", 250.0, 400.0))
 MANIFEST = Manifest(

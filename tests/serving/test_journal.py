@@ -23,13 +23,11 @@ from processes import within
 
 from loopwright.serving import Controller, LoopError
 from loopwright.serving.journal import Event, Journal, JournalReader, Scan, columns, writer
-from loopwright.serving.journal.entries import Kind
+from loopwright.serving.journal.entries import Kind, packed, unpacked
 from loopwright.serving.journal.file import TABLES
-from loopwright.serving.journal.packing import packed, unpacked
 from loopwright.serving.journal.reader import EVENT
-from loopwright.serving.journal.rotation import LEAST_EVENTS, SLACK, shorten_events
-from loopwright.serving.journal.writer import BLOCK, FRESH
-from loopwright.serving.page import metrics
+from loopwright.serving.journal.writer import BLOCK, FRESH, LEAST_EVENTS, SLACK, shorten_events
+from loopwright.serving.page import app
 from loopwright.serving.station.recorder import Recorder
 
 pytest_plugins = ["small_laws"]
@@ -727,4 +725,4 @@ def test_the_metrics_tell_what_the_journal_lost() -> None:
     about = {"card": {"law": "pi", "case": "tank", "sha256": "0", "file": "pi.onnx"}, "info": [],
              "signals": {name: [] for name in ("sp", "pv", "mv", "dv")}}  # fmt: skip
     state = {"alive": True, "mode": "AUTO", "time": 1.0, "journal": "", "journal_lost": 32}
-    assert "loopwright_journal_lost_total 32.0" in metrics.text(about, state).splitlines()
+    assert "loopwright_journal_lost_total 32.0" in app.metrics_text(about, state).splitlines()

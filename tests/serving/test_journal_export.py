@@ -12,7 +12,7 @@ import pytest
 from loopwright.pipeline.historian.cleaning.tags import read_tags
 from loopwright.serving import Controller, Signal
 from loopwright.serving.journal import Journal, Scan, columns
-from loopwright.serving.station.export import export, tag_table
+from loopwright.serving.station.journal_export import export, tag_table
 
 pytest_plugins = ["small_laws"]
 

@@ -28,10 +28,11 @@ WRITER = """
 import os, signal, sys, time
 from pathlib import Path
 from loopwright.serving import Manifest
-from loopwright.serving.journal import Event, Journal, Scan, rotation, writer
+from loopwright.serving.journal import writer
+from loopwright.serving.journal import Event, Journal, Scan, writer
 path, manifest, small = Path(sys.argv[1]), Manifest.from_json(sys.argv[2]), sys.argv[3] == "small"
 if small:
-    writer.BLOCK, writer.FRESH, writer.FLUSH_S, rotation.LEAST_EVENTS = 20, 40, 0.02, 60
+    writer.BLOCK, writer.FRESH, writer.FLUSH_S, writer.LEAST_EVENTS = 20, 40, 0.02, 60
 
 def write(statement, nth):
     journal, seen = Journal(path, max_mb=0.02 if small else 2000.0), 0

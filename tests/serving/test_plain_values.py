@@ -11,11 +11,9 @@ import pytest
 from shipped_files import SHIPPED
 
 from loopwright.serving import ArtifactError, Controller, LoopError
-from loopwright.serving.digest import file_digest
-from loopwright.serving.fields import parse
+from loopwright.serving.controller_file import difference, file_digest, sidecar
+from loopwright.serving.fields import LONGEST_SHOWN, MAX_DIGITS, parse, refused, shown
 from loopwright.serving.manifest import MAX_CHARACTERS, Manifest, strictly
-from loopwright.serving.plain_values import LONGEST_SHOWN, MAX_DIGITS, refused, shown
-from loopwright.serving.sidecar import difference, sidecar
 from loopwright.serving.station.settings import Settings
 
 LONG = 16**5001

@@ -21,8 +21,8 @@ from served_plant import PERIOD_S, SPEED, begun, cut, mend, read, served, wired,
 
 from loopwright.serving import Command, Mode
 from loopwright.serving.journal import Scan
+from loopwright.serving.mv_readback import SAME
 from loopwright.serving.opcua.certificates import make
-from loopwright.serving.standing import SAME
 
 START = 250.0  # the MV of the plant's start
 

@@ -14,14 +14,13 @@ from asyncua import ua
 
 from loopwright.serving import Controller, EndpointError, Sample, VirtualClock
 from loopwright.serving.journal import JournalReader
-from loopwright.serving.opcua.ages import Ages
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.plan import Plan
-from loopwright.serving.opcua.sampling import Sampling, Values
+from loopwright.serving.opcua.sampling import Ages, Sampling, Values
 from loopwright.serving.opcua.settings import Nodes, Server
 from loopwright.serving.opcua.values import Reading
 from loopwright.serving.station import station
-from loopwright.serving.station.export import export
+from loopwright.serving.station.journal_export import export
 from loopwright.serving.station.lease import Lease
 from loopwright.serving.station.settings import JournalSettings, Settings
 from loopwright.serving.station.station import Station

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from loopwright.serving import Controller, ControlLoop, LoopError, Mode
+from loopwright.serving.controller_file import manifest_in
 from loopwright.serving.proof import Proof, judged
-from loopwright.serving.sidecar import manifest_in
 from loopwright.serving.station.requests import Change, Request, change
 
 FILE = Path(__file__).parents[2] / "artifacts" / "jacketed_batch_reactor" / "fuzzy_feedforward_observer.onnx"

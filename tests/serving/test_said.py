@@ -6,7 +6,7 @@ import threading
 
 from processes import within
 
-from loopwright.serving.station.said import WAITING, Said
+from loopwright.serving.station.housekeeping import WAITING, Said
 
 
 def test_lines_come_in_their_order_and_an_end_waits_for_them() -> None:

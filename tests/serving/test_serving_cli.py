@@ -14,7 +14,7 @@ from loopwright.pipeline.export.controller_file import with_evidence
 from loopwright.serving import ArtifactError, Controller, Manifest
 from loopwright.serving.__main__ import main
 from loopwright.serving.station import command
-from loopwright.serving.station.template import template
+from loopwright.serving.station.settings import template
 from loopwright.serving.words import harmless, plain
 
 pytest_plugins = ["small_laws"]

@@ -15,7 +15,7 @@ from processes import within
 
 from loopwright.pipeline.__main__ import main
 from loopwright.serving import LoopError
-from loopwright.serving.page.candidates import candidates
+from loopwright.serving.page.app import candidates
 from loopwright.serving.station.control import ask
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.trust import signer

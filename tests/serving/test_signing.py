@@ -24,7 +24,7 @@ from signing_parts import DAY_AFTER, NOW, edit_bundle, payload_of, sign_payload
 from loopwright.pipeline.__main__ import main as loopwright
 from loopwright.pipeline.export.controller_file import with_evidence
 from loopwright.serving import ArtifactError, SignatureError
-from loopwright.serving.digest import file_digest
+from loopwright.serving.controller_file import file_digest
 from loopwright.serving.signing import bundle
 from loopwright.serving.signing.keys import PrivateKey, PublicKey, make_pair
 from loopwright.serving.signing.sign import sign

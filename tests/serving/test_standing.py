@@ -23,7 +23,7 @@ from loopwright.serving import (
     Signal,
     VirtualClock,
 )
-from loopwright.serving.standing import SAME, SETTLED, Standing
+from loopwright.serving.mv_readback import SAME, SETTLED, Standing
 
 pytest_plugins = ["small_laws"]
 RANGE = 100.0

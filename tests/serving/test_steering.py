@@ -28,7 +28,7 @@ from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving import Controller, LoopError, Mode
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.journal.reader import Entry
-from loopwright.serving.page.candidates import candidates
+from loopwright.serving.page.app import candidates
 from loopwright.serving.station.control import ask
 
 pytest_plugins = ["small_laws"]

@@ -16,7 +16,7 @@ import loopwright.serving.controller
 from loopwright.pipeline.export.controller_file import with_evidence
 from loopwright.serving import ArtifactError, Controller, LoopwrightError, SignatureError
 from loopwright.serving.__main__ import main
-from loopwright.serving.digest import file_digest
+from loopwright.serving.controller_file import file_digest
 from loopwright.serving.signing import verify
 from loopwright.serving.signing.keys import PrivateKey
 from loopwright.serving.signing.sign import sign

@@ -26,9 +26,8 @@ from loopwright.serving.opcua.lease import SCANS, NodeLease
 from loopwright.serving.opcua.nameplates import Identity
 from loopwright.serving.station import station
 from loopwright.serving.station.control import Control, ask, door
-from loopwright.serving.station.lease import Lease, address_of
-from loopwright.serving.station.locks import Locks
-from loopwright.serving.station.tending import Tending
+from loopwright.serving.station.housekeeping import Tending
+from loopwright.serving.station.lease import Lease, Locks, address_of
 
 SPEED = 2.0  # periods of .25 s: a loop counts as gone after five without a renewal
 LEASE = f'lease = "{SPACE}Control.Lease"'

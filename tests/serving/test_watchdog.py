@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from loopwright.serving import Controller
-from loopwright.serving.fault import kind_of
+from loopwright.serving.guard import kind_of
 from loopwright.serving.opcua.sampling import Sampling
 from loopwright.serving.opcua.settings import Nodes, Server
 

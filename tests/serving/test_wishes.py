@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from loopwright.serving.station.wishes import Wishes
+from loopwright.serving.station.requests import Wishes
 
 
 def values(sp: dict[str, float] | None = None, mode: str = "", starts: int = 0) -> Any:

@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from loopwright.pipeline.models.identified.selection import Selection
-from loopwright.pipeline.models.identified.structure_search import Searched, StructureSearch
+from loopwright.pipeline.models.identified.structure_search import Searched, Selection, StructureSearch
 from loopwright.pipeline.models.part import Groundwork, Learnt, Part, Source, done
 from loopwright.pipeline.stages.fit import _proven_if_possible
 

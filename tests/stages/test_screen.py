@@ -25,7 +25,7 @@ from loopwright.pipeline.files import sha256
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.models.identified.structure_search import MINUTES, StructureSearch
 from loopwright.pipeline.models.part import groundworks
-from loopwright.pipeline.records.old_controller import OldController
+from loopwright.pipeline.records.old_loops import OldController
 from loopwright.pipeline.stages.check import mistakes
 from loopwright.pipeline.stages.code import listing
 from loopwright.pipeline.stages.fit import parts_of

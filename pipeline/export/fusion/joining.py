@@ -10,8 +10,8 @@ import onnx
 from onnx import helper, numpy_helper
 
 from loopwright.pipeline.export.fusion.affine import DENSE, Shape
-from loopwright.serving.graph_audit import graph_values
-from loopwright.serving.onnx_bytes import read_model
+from loopwright.serving.graph.audit import graph_values
+from loopwright.serving.graph.onnx_bytes import read_model
 
 JOINED = "Tanh"
 MARK = "joined"  # in the names of what is added

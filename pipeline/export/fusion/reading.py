@@ -12,8 +12,8 @@ from loopwright.pipeline.export.fusion import intervals, normal_form
 from loopwright.pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, applied
 from loopwright.pipeline.export.fusion.prices import OUTPUT, price
 from loopwright.pipeline.export.fusion.values import Block, Operand, Origin, Value
-from loopwright.serving.graph_audit import graph_values
-from loopwright.serving.onnx_bytes import read_model
+from loopwright.serving.graph.audit import graph_values
+from loopwright.serving.graph.onnx_bytes import read_model
 
 DOUBLE = onnx.TensorProto.DOUBLE
 OWN = ""  # the name of a value that the graph does not have; it is a double

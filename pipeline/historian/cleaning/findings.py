@@ -6,8 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from loopwright.pipeline.historian.cleaning.sampling import Sampling
-from loopwright.pipeline.records.old_controller import OldController
-from loopwright.pipeline.records.operated import Operated
+from loopwright.pipeline.records.old_loops import OldController, Operated
 
 
 def counted(n: int, one: str, more: str = "") -> str:

@@ -16,8 +16,8 @@ from loopwright.pipeline.config.plants import mistakes_of_mv
 from loopwright.pipeline.errors import RecordError, nearest
 from loopwright.pipeline.files import write_text
 from loopwright.pipeline.historian.cleaning.findings import InputReport
+from loopwright.serving.fields import shown
 from loopwright.serving.manifest import MAX_NAME, Signal
-from loopwright.serving.plain_values import shown
 
 ROLES = ("pv", "mv", "dv", "sp", "mode")
 SIGNAL_ROLES = ("pv", "mv", "dv")

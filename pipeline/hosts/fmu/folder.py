@@ -13,7 +13,7 @@ from loopwright.pipeline.hosts.fmu.compiling import HOSTS, SOURCES, Toolchain
 from loopwright.pipeline.hosts.fmu.description import build_description, description, page
 from loopwright.pipeline.plants.fmu.description import fmpy
 from loopwright.serving.controller import Controller
-from loopwright.serving.digest import file_digest
+from loopwright.serving.controller_file import file_digest
 
 MADE = (1980, 1, 1, 0, 0, 0)  # the time of every entry: the same controller gives the same bytes
 QUICK = 1  # compression: onnxruntime's library is nearly all of the file, and 9 saves a tenth of it

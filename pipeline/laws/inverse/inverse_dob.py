@@ -22,13 +22,24 @@ from loopwright.pipeline.laws.base import (
 )
 from loopwright.pipeline.laws.inverse.learnt_parts import learnt_parts
 from loopwright.pipeline.laws.inverse.self_chosen import LONGEST, Choice
-from loopwright.pipeline.laws.ranges import OfRange, in_units
+from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
-from loopwright.pipeline.models.static.candidates import candidates
+from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Simulator
 
+
+def candidates(model: Model, x: Tensor, u: Tensor) -> Tensor:
+    """Predictions (..., K) of a model over [x, u] at one state x (..., n) for candidates u (..., K)."""
+    if isinstance(model, MLP):
+        return model.sections(x, u.unsqueeze(-1)).squeeze(-1)
+    states = x.unsqueeze(-2).expand(*u.shape, x.shape[-1])
+    y: Tensor = model(torch.cat([states, u.unsqueeze(-1)], dim=-1))
+    return y.squeeze(-1)
+
+
+# ------------------------------------------------------------------------------------------------------------- the law
 # Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
 FOLLOWED = 1e-3
 OWN_CHOICE = ("identified",)  # parts of a set from which a law chooses and learns its networks itself

@@ -12,7 +12,7 @@ from torch import Tensor
 from loopwright.pipeline.laws.adaptive import move, signed_unit, target, target_slots
 from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
 from loopwright.pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid, central_model, next_output
-from loopwright.pipeline.laws.ranges import OfRange, in_units
+from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.lagged.next_output import GaussNewton
 from loopwright.pipeline.models.lagged.nnarx import NNARX

@@ -12,7 +12,7 @@ from torch import Tensor
 from loopwright.pipeline.laws.adaptive import move, target
 from loopwright.pipeline.laws.base import Stepped, hold_numbers
 from loopwright.pipeline.laws.linearized.nnarx_law import NnarxParams, NnarxPid
-from loopwright.pipeline.laws.ranges import ascend, in_units
+from loopwright.pipeline.laws.scaled_defaults import ascend, in_units
 from loopwright.pipeline.models.lagged.next_output import Ahead
 from loopwright.pipeline.models.lagged.nnarx import NNARX
 from loopwright.pipeline.models.memory import Named, Slot

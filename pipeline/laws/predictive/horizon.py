@@ -11,14 +11,37 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from loopwright.pipeline.laws.base import hold_numbers
-from loopwright.pipeline.laws.predictive.loads import Loads
-from loopwright.pipeline.laws.predictive.moves import Moves
-from loopwright.pipeline.laws.predictive.one_step import one_step
-from loopwright.pipeline.laws.predictive.product import product
+from loopwright.pipeline.laws.predictive.disturbance_model import Loads
+from loopwright.pipeline.laws.predictive.move_blocking import Moves
 from loopwright.pipeline.models.affine_map import AffineMap
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.memory import Named
 
+
+def product(x: Tensor, w: Tensor, b: Tensor) -> Tensor:
+    """Affine map x W + b for x (..., i, n), w (..., n, k), b broadcastable to (..., i, k).
+
+    Matrices without leading dimensions, as in an exported graph, take one operator (Gemm), which has half the cost of
+    two in a chain of small products.
+    """
+    return torch.addmm(b, x, w) if x.ndim == w.ndim == 2 else x @ w + b
+
+
+# ---------------------------------------------------------------- one step of the model, in the pieces that are affine
+def one_step(model: Identified, loads: Loads, p: Named) -> dict[str, Tensor]:
+    """``next`` = A x + B v' + c + X d and ``hidden`` = W1 [x, v'] + b1, which a linear model lacks; v' = v + V d.
+
+    x+ = next + W2 tanh(hidden), of x (..., n_x), d (..., n_d) and v (..., n_v), all scaled.
+    """
+    x, d = p["x"], p["d"]
+    v = p["v"] + d @ loads.into_v.T
+    found = {"next": x @ model.a.T + v @ model.b.T + model.c + d @ loads.into_x.T}
+    if model.n_hidden:
+        found["hidden"] = torch.cat([x, v], dim=-1) @ model.w1.T + model.b1
+    return found
+
+
+# ---------------------------------------------------------------------------------------------- the run over a horizon
 Scaling = Callable[[Tensor], Tensor]
 """The scaled MVs (..., n_mv) of a model for MVs (..., n_mv) within -1..1."""
 SMALL = 1e-6  # tanh(SMALL x)/SMALL is x to 3e-13 x^3

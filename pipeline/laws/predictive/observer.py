@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from loopwright.pipeline.laws.base import hold_numbers
-from loopwright.pipeline.laws.predictive.loads import Loads
-from loopwright.pipeline.laws.predictive.one_step import one_step
-from loopwright.pipeline.laws.predictive.product import product
+from loopwright.pipeline.laws.predictive.disturbance_model import Loads
+from loopwright.pipeline.laws.predictive.horizon import one_step, product
 from loopwright.pipeline.models.affine_map import AffineMap
 from loopwright.pipeline.models.identified.identified import Identified
 

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
+from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, held_rest, loads_of
 from loopwright.pipeline.laws.predictive.horizon import horizon_of
-from loopwright.pipeline.laws.predictive.loads import Loads, balanced, held_rest, loads_of
-from loopwright.pipeline.laws.predictive.moves import Moves
+from loopwright.pipeline.laws.predictive.horizon_check import Sight, horizon_for, mvs_of, refuse_unstable
+from loopwright.pipeline.laws.predictive.move_blocking import Moves
 from loopwright.pipeline.laws.predictive.observer import Estimate, Noises, Observer, load_variance
 from loopwright.pipeline.laws.predictive.params import (
     PredictiveParams,
@@ -21,13 +22,10 @@ from loopwright.pipeline.laws.predictive.params import (
     refuse_discrete,
     weights_of,
 )
-from loopwright.pipeline.laws.predictive.plan import Cost, Planner
-from loopwright.pipeline.laws.predictive.set_points import SetPoints
-from loopwright.pipeline.laws.predictive.settling import horizon_for, mvs_of, refuse_unstable
-from loopwright.pipeline.laws.predictive.sight import Sight
-from loopwright.pipeline.laws.predictive.soft_limits import PRICE, SoftLimits
-from loopwright.pipeline.laws.predictive.trials import Trials
+from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
+from loopwright.pipeline.laws.predictive.set_points import PRICE, SetPoints, SoftLimits
 from loopwright.pipeline.laws.predictive.tuning import Candidate, calmest, in_words, tuned
+from loopwright.pipeline.laws.predictive.tuning_loops import Trials
 from loopwright.pipeline.models.affine_map import AffineMap
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified

@@ -11,8 +11,7 @@ import numpy as np
 from loopwright.pipeline.engine.progress import steps
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
-from loopwright.pipeline.laws.predictive.side_by_side import side_by_side
-from loopwright.pipeline.laws.predictive.trials import Outcome
+from loopwright.pipeline.laws.predictive.tuning_loops import Outcome, side_by_side
 
 TRAVEL = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
 NEAR = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it

@@ -12,8 +12,8 @@ from torch import Tensor
 from loopwright.pipeline.laws.adaptive import signed_unit
 from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_single_loop
 from loopwright.pipeline.laws.gain_update import PidForm
-from loopwright.pipeline.laws.ranges import OfRange, in_units
 from loopwright.pipeline.laws.recursive.arx_law import estimator, require_arx
+from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.lagged.arx import ARX
 from loopwright.pipeline.models.memory import Memory, Slot

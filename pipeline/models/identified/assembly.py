@@ -8,8 +8,8 @@ import numpy as np
 
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified import Identified
-from loopwright.pipeline.models.identified.rests import central_map, rest_map
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.identified.steady_states import central_map, rest_map
 from loopwright.pipeline.plants.simulator import Array
 
 ANSWERS = 0.1

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.models.identified.drift import error_beyond_drift
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.innovations import (
     Innovations,
@@ -17,11 +16,13 @@ from loopwright.pipeline.models.identified.innovations import (
     innovations,
     with_loads,
 )
-from loopwright.pipeline.models.identified.lagged_start import lagged_start, output_rows, with_units
 from loopwright.pipeline.models.identified.linear_start import (
     Realizations,
     dead_times,
     high_order_arx,
+    lagged_start,
+    output_rows,
+    with_units,
     within_unit_circle,
 )
 from loopwright.pipeline.models.identified.output_error import (
@@ -30,7 +31,8 @@ from loopwright.pipeline.models.identified.output_error import (
     fit_starts,
     residuals,
 )
-from loopwright.pipeline.models.identified.rests import settle
+from loopwright.pipeline.models.identified.residual_tests import error_beyond_drift
+from loopwright.pipeline.models.identified.steady_states import settle
 from loopwright.pipeline.models.identified.structure import Problem, Structure
 from loopwright.pipeline.plants.simulator import Array
 

@@ -12,23 +12,27 @@ from loopwright.pipeline.config.known import NONE
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.assembly import assembled, noise_of
 from loopwright.pipeline.models.identified.candidates import on_all_rows, within_limits
-from loopwright.pipeline.models.identified.coupling import sign_margin, unused_answers
-from loopwright.pipeline.models.identified.doubt import colour_of, doubt_of
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
-from loopwright.pipeline.models.identified.known_answers import known_figures
+from loopwright.pipeline.models.identified.knowledge import known_figures
+from loopwright.pipeline.models.identified.model_validation import (
+    Answer,
+    answers,
+    foreseen,
+    proof_figures,
+    sign_margin,
+    unused_answers,
+)
 from loopwright.pipeline.models.identified.network_search import UNITS
 from loopwright.pipeline.models.identified.output_error import Fitted, fit_starts, residuals
-from loopwright.pipeline.models.identified.proof import Answer, answers, foreseen, proof_figures
+from loopwright.pipeline.models.identified.parameter_uncertainty import colour_of, doubt_of, drawn
 from loopwright.pipeline.models.identified.regions import Cells
 from loopwright.pipeline.models.identified.residual_tests import residual_figures
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from loopwright.pipeline.models.identified.selection import Selection
-from loopwright.pipeline.models.identified.stability import stability_figures
+from loopwright.pipeline.models.identified.steady_states import stability_figures
 from loopwright.pipeline.models.identified.structure import Problem, Structure
-from loopwright.pipeline.models.identified.structure_search import Searched, StructureSearch
-from loopwright.pipeline.models.identified.uncertainty import drawn
+from loopwright.pipeline.models.identified.structure_search import Searched, Selection, StructureSearch
 from loopwright.pipeline.models.identified.verdict import (
     STEP,
     dead_times,

@@ -12,8 +12,7 @@ from loopwright.pipeline.models.identified.candidates import Start, Task
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.linear_start import within_unit_circle
 from loopwright.pipeline.models.identified.rounds import Rounds
-from loopwright.pipeline.models.identified.structure import Structure
-from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.identified.structure import Structure, Trial
 
 MOST_STATES = 18
 """States of a lagged start beyond which it is not tried."""

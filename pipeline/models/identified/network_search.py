@@ -9,8 +9,7 @@ import numpy as np
 
 from loopwright.pipeline.models.identified.candidates import BEGINNING, Task
 from loopwright.pipeline.models.identified.rounds import Rounds
-from loopwright.pipeline.models.identified.structure import Structure
-from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.identified.structure import Structure, Trial
 
 SEEDS = (3, 6)
 """Fewest and most seeds of each network that reaches the last round; short records carry more of them."""

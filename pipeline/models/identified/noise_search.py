@@ -15,8 +15,7 @@ from loopwright.pipeline.models.identified.candidates import Task
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
 from loopwright.pipeline.models.identified.rounds import Rounds
-from loopwright.pipeline.models.identified.structure import Problem, Structure
-from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.identified.structure import Problem, Structure, Trial
 from loopwright.pipeline.tuning.responses import reached
 
 ITERATIONS = 20

@@ -14,8 +14,8 @@ from typing import Self
 import numpy as np
 
 from loopwright.pipeline.models.identified.dynamics import Dynamics
-from loopwright.pipeline.models.identified.rests import central_map, settle
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.models.identified.steady_states import central_map, settle
 from loopwright.pipeline.plants.simulator import Array
 
 EDGES = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95)  # quantiles of an MV over its data between which its cells lie

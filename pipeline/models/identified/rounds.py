@@ -9,8 +9,7 @@ from functools import partial
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.models.identified.candidates import Start, Task, find_start, fit, judged_beyond_drift
 from loopwright.pipeline.models.identified.output_error import Fitted
-from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure
-from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure, Trial
 
 
 @dataclass(frozen=True, slots=True, eq=False)

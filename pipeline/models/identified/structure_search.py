@@ -1,19 +1,243 @@
-"""The search for a structure as work that the members of an ensemble share."""
+"""Structure search: linear candidates, then networks on the best of them, ranked by free runs over held-out rows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from loopwright.pipeline.historian.answers import Beside, beside_record
 from loopwright.pipeline.historian.feedback import fed_back
+from loopwright.pipeline.models.identified.candidates import RESTS, misses, rests_under
 from loopwright.pipeline.models.identified.knowledge import Knowledge
+from loopwright.pipeline.models.identified.linear_search import LinearSearch, smallest_first
+from loopwright.pipeline.models.identified.network_search import NetworkSearch
+from loopwright.pipeline.models.identified.noise_search import NATS, NETWORK_NATS, NoiseSearch, likely_dead_times, nats
+from loopwright.pipeline.models.identified.residual_tests import Drift, curved, drift_of
 from loopwright.pipeline.models.identified.rounds import Rounds
-from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds, informative
-from loopwright.pipeline.models.identified.selection import Selection, select
-from loopwright.pipeline.models.identified.structure import Budget, Problem
+from loopwright.pipeline.models.identified.scaled_record import (
+    ScaledRecord,
+    Scales,
+    folds,
+    informative,
+    may_act_in_its_row,
+)
+from loopwright.pipeline.models.identified.steady_states import INTEGRATES
+from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Trial, best_of
 from loopwright.pipeline.models.part import Groundwork, Source
 
+SETTLES = 0.98
+"""Slowest pole of a fold up to which it speaks for a plant that settles, where another one integrates."""
+
+NEARLY = 1.02
+"""Relative error up to which a linear model that settles stands in for one that integrates."""
+
+FARTHER = 2.0
+"""Times the largest rest of the linear model up to which rests of a network may lie."""
+
+SLOW = 0.05
+"""Correction of training runs that is tried where the linear model integrates, or the best network misses much."""
+
+DRIFTS = 1.5
+"""Residual over noise of the best network above which the correction is tried."""
+
+GAIN = 0.01
+"""Least relative gain of a network over the linear model, beside its spread."""
+
+WHITE = 1.01
+"""Residual over noise up to which a linear model leaves nothing to gain but curves of its state and its inputs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """The outcome of a search: the best linear candidate, the best network (None without one), and all finalists."""
+
+    linear: Trial
+    network: Trial | None
+    finalists: list[Trial]
+    spent: float  # nominal seconds
+    settles: bool  # whether the linear model comes to rest by itself
+    drifts: bool  # whether gain or level move inside the record
+    innovations: float | None = None  # nats by which one-step errors prefer the network; None: free runs judged
+    farthest: float = FARTHEST  # scaled: where rests of a network may lie
+    dead_times: Sequence[tuple[int, int]] = ()  # [periods] least and most of each input that explain the rows alike
+    refused: bool = False  # whether the record does not prove the network's gains: the linear model takes its place
+
+    @property
+    def nonlinear(self) -> bool:
+        """Whether the network wins by more than the standard error of its seeds' median, and by more than ``GAIN``.
+
+        In a record that drifts the seeds differ by what each took for drift, so that ``GAIN`` alone decides. Noise is
+        nearly all of one-step errors, and their log-likelihood decides.
+        """
+        if self.network is None or self.refused:
+            return False
+        if self.network.against != self.linear.against:  # what is known of the plant decides before any error
+            return self.network.against < self.linear.against
+        if self.innovations is not None:
+            return self.innovations > NETWORK_NATS
+        uncertain = 0.0 if self.drifts else self.network.spread / np.sqrt(self.network.seeds)
+        return bool(self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error)
+
+    @property
+    def chosen(self) -> Trial:
+        """The network where it wins by more than its uncertainty, else the linear model."""
+        return self.network if self.network is not None and self.nonlinear else self.linear
+
+    @property
+    def factor(self) -> float:
+        """Held-out error of the linear model over that of the best network; 1 where no network was tried."""
+        return self.linear.error / self.network.error if self.network is not None else 1.0
+
+
+def select(
+    rounds: Rounds,
+    *,
+    orders: Sequence[int],
+    units: Sequence[int],
+    correction: float | None = None,
+    lagged: bool = True,
+) -> Selection:
+    """The search over one record.
+
+    Linear candidates first: balanced starts of each order with and without the dead times that the impulse
+    response shows, and lagged starts unless ``lagged`` is false; where the record leaves it open, with the MVs acting
+    in their own row too. Then networks on the best of them, unless its residual is white and follows no curve of its
+    state and its inputs, in rounds that keep fewer and train them longer. When the budget is spent, what there is
+    decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
+    much more than the noise, and the models so trained err less over held-out rows: in plain free runs, or, where the
+    plant drifts inside the record, beyond a gain and a level of each part. Raises ModelError where no candidate can be
+    fitted.
+    """
+    if rounds.problem.fed_back and correction is None:
+        return by_innovations(rounds, orders, units)
+    given = 0.0 if correction is None else correction
+    search = LinearSearch.of(rounds)
+    linear = search.finish(search.first_round(orders, given, lagged))
+    if _integrates(linear[0]):
+        settling = [t for t in search.settling(linear) if not _integrates(t) and _nearly(t, linear[0])]
+        linear = [*settling[:1], *(t for t in linear if t.structure != settling[0].structure)] if settling else linear
+    if correction is None and _integrates(linear[0]):
+        corrected = search.corrected(linear, SLOW)
+        linear = corrected if corrected and corrected[0].rank < linear[0].rank else linear
+    if may_act_in_its_row(rounds.problem.part(linear[0].structure, rounds.problem.folds[0].train), rounds.problem.n_mv):
+        # Both conventions stay on offer: the networks' held-out error may decide otherwise than the linear models'.
+        linear = smallest_first([*linear, *search.in_the_same_row(linear)])
+    offered = linear if correction is not None else [_with_correction(t, 0.0) for t in linear]
+    problem = _as_its_linear_model(rounds.problem, linear[0])
+    networks = NetworkSearch(replace(rounds, problem=problem), offered)
+    lacking = _misses(rounds.problem, linear[0], WHITE) or _curved(rounds.problem, linear[0])
+    finalists = networks.finalists(units) if lacking else []
+    best = best_of(finalists)
+    drift = None
+    if correction is None and best is not None:
+        seen = [linear[0], best]
+        if _misses(rounds.problem, best, DRIFTS):
+            # Models whose training runs take their error back are not bent to follow a drift, so that they show it.
+            corrected = networks.corrected(best, SLOW)
+            finalists += corrected
+            seen += corrected[:1]
+        drift = max((_drift(rounds.problem, trial) for trial in seen), key=lambda found: found.share)
+    drifting = drift is not None and drift.found
+    if drift is not None and drifting:
+        # Plain free runs would rank candidates by how they follow what no model can.
+        linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
+        linear = smallest_first(rounds.judged_beyond_drift(linear, drift.rows))
+        finalists = rounds.judged_beyond_drift(finalists, drift.rows)
+    every, spent = [*linear, *finalists], rounds.budget.spent
+    return Selection(linear[0], best_of(finalists), every, spent, problem.settles, drifting, None, problem.farthest)
+
+
+def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) -> Selection:
+    """The search among models with their noise, judged by one-step errors over held-out rows: for closed loops.
+
+    Free runs would rank them by how they read the controller backwards, and by the loads that nobody measures.
+    """
+    search = NoiseSearch.of(rounds)
+    ranked = search.linear(orders)
+    linear = _settling_first(rounds.problem, ranked)
+    problem = _as_its_linear_model(rounds.problem, linear[0])
+    search = replace(search, rounds=replace(rounds, problem=problem))
+    networks = search.networks(linear, units)
+    best = best_of(networks)
+    # Nothing is gained by what the linear model gave away to settle, or for the middle dead time.
+    rival = min((*ranked[:2], linear[0]), key=lambda t: t.rank)
+    gained = 0.0 if best is None else nats(rounds.problem, rival, best)
+    every, spent = [*linear, *networks], rounds.budget.spent
+    alike = likely_dead_times(problem, ranked)
+    return Selection(linear[0], best, every, spent, problem.settles, False, gained, problem.farthest, alike)
+
+
+def _nearly(trial: Trial, best: Trial) -> bool:
+    return trial.against <= best.against and trial.error <= NEARLY * best.error
+
+
+def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
+    """Where the best integrates in a fold, one that settles in all first, if it errs as little.
+
+    A load that wanders and a state of the plant that drifts are hard to tell apart one row ahead. A state that drifts
+    in one part of the record alone, or that a model of a quick plant does without, is the load's, and leaves the plant
+    without a gain. One that settles clearly goes before others, and alone where all parts show a pole at 1; of these
+    one of the same dead times first.
+    """
+    best = linear[0]
+    slowest = [_slowest(best, fold) for fold in best.folds]
+    if max(slowest) <= INTEGRATES:
+        return linear
+    alike = [t for t in linear if t.against == best.against and nats(problem, t, best) <= NATS]
+    alike.sort(key=lambda t: t.structure.delays != best.structure.delays)
+    for limit in (SETTLES, INTEGRATES) if min(slowest) <= SETTLES else (SETTLES,):
+        settling = next((t for t in alike if all(_slowest(t, fold) <= limit for fold in t.folds)), None)
+        if settling is not None:
+            return [settling, *(t for t in linear if t is not settling)]
+    return linear
+
+
+def _drift(problem: Problem, trial: Trial) -> Drift:
+    return drift_of(trial.of_fold(trial.folds[0])[0].model, problem.whole(trial.structure))
+
+
+def _with_correction(trial: Trial, correction: float) -> Trial:
+    return Trial(replace(trial.structure, correction=correction), trial.fits)
+
+
+def _integrates(trial: Trial) -> bool:
+    return max(_slowest(trial, fold) for fold in trial.folds) > INTEGRATES
+
+
+def _as_its_linear_model(problem: Problem, trial: Trial) -> Problem:
+    """The problem with the test that networks have to pass, which the linear model must pass itself.
+
+    A pole below ``INTEGRATES`` can be too slow to come to rest in that test, and rests of a high gain lie far off: a
+    test that the linear model fails rejects every network. One that it passes in a single fold is asked all the same:
+    a plant that fades or drifts integrates in a part of its record, and networks that run away are no models of it.
+    """
+    n_y = problem.data.y.shape[1]
+    found = [rests_under(trial.of_fold(fold)[0].model.plant, problem) for fold in trial.folds]
+    resting = [x for x, share in found if share >= RESTS]
+    largest = max((float(np.abs(x[:, :n_y]).max()) for x in resting), default=0.0)
+    return replace(problem, settles=bool(resting), farthest=max(problem.farthest, FARTHER * largest))
+
+
+def _slowest(trial: Trial, fold: int) -> float:
+    """The largest magnitude of a pole of a fold's best fit."""
+    return float(np.abs(np.linalg.eigvals(trial.of_fold(fold)[0].model.plant.a)).max())
+
+
+def _curved(problem: Problem, trial: Trial) -> bool:
+    fold = trial.folds[0]
+    best = trial.of_fold(fold)[0]
+    return curved(best.model, best.starts, problem.train(trial.structure, fold), trial.structure.correction)
+
+
+def _misses(problem: Problem, trial: Trial, ratio: float) -> bool:
+    fold = trial.folds[0]
+    best = trial.of_fold(fold)[0]
+    return misses(best.model, best.starts, problem.train(trial.structure, fold), ratio, trial.structure.correction)
+
+
+# ------------------------------------------------------------ the search as work that the members of an ensemble share
 MINUTES = 2.0
 """Budget for each output, in minutes of one core."""
 

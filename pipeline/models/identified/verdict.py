@@ -11,15 +11,21 @@ from numpy.typing import NDArray
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.metrics import fit_percent
 from loopwright.pipeline.models.identified.assembly import dead_periods, step_responses
-from loopwright.pipeline.models.identified.doubt import spread
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.innovations import AHEAD, Innovations, ahead
 from loopwright.pipeline.models.identified.output_error import fit_starts
-from loopwright.pipeline.models.identified.rests import INTEGRATES, LONG, central_map, middle_rest, settle, steady_gain
+from loopwright.pipeline.models.identified.parameter_uncertainty import spread
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from loopwright.pipeline.models.identified.selection import Selection
-from loopwright.pipeline.models.identified.structure import Problem
-from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.identified.steady_states import (
+    INTEGRATES,
+    LONG,
+    central_map,
+    middle_rest,
+    settle,
+    steady_gain,
+)
+from loopwright.pipeline.models.identified.structure import Problem, Trial
+from loopwright.pipeline.models.identified.structure_search import Selection
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.manifest import Signal
 

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopwright.pipeline.models.identified.coupling import MOST_OPEN, sign_margin, unused_answers
-from loopwright.pipeline.models.identified.proof import Answer
+from loopwright.pipeline.models.identified.model_validation import MOST_OPEN, Answer, sign_margin, unused_answers
 from loopwright.pipeline.models.identified.structure import Structure
 
 CERTAIN = Answer(1.0, 0.9, 1.1, 1, 9, 1.0, 0.05)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.models.identified.candidates import misses
-from loopwright.pipeline.models.identified.curvature import curved
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
-from loopwright.pipeline.models.identified.selection import WHITE
+from loopwright.pipeline.models.identified.residual_tests import curved
+from loopwright.pipeline.models.identified.structure_search import WHITE
 
 FIRST = Dynamics.linear(np.array([[0.8]]), np.array([[0.5]]))
 

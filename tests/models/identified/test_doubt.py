@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.pipeline.models.identified.doubt import MOST_COLOUR, colour_of, doubt_of
+from loopwright.pipeline.models.identified.parameter_uncertainty import MOST_COLOUR, colour_of, doubt_of
 from loopwright.pipeline.plants.noise import coloured
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import made_plants
 import numpy as np
 
-from loopwright.pipeline.models.identified.drift import drift_of, error_beyond_drift
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.residual_tests import drift_of, error_beyond_drift
 
 MODEL = Dynamics.linear(np.array([[0.9]]), np.array([[0.1]]))
 ROWS = 4000

@@ -22,8 +22,7 @@ from loopwright.pipeline.models.identified.innovations import (
     typical,
     with_loads,
 )
-from loopwright.pipeline.models.identified.output_error import OutputError, residuals
-from loopwright.pipeline.models.identified.sensitivities import sensitivity_sums
+from loopwright.pipeline.models.identified.output_error import OutputError, residuals, sensitivity_sums
 
 Array = np.ndarray
 

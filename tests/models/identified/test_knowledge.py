@@ -18,8 +18,7 @@ from loopwright.pipeline.models.identified.knowledge import Knowledge, Pair
 from loopwright.pipeline.models.identified.linear_search import smallest_first
 from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
-from loopwright.pipeline.models.identified.structure import Structure
-from loopwright.pipeline.models.identified.trial import Trial, best_of
+from loopwright.pipeline.models.identified.structure import Structure, Trial, best_of
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.records.record import Record

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.models.identified.dynamics import Dynamics
-from loopwright.pipeline.models.identified.rests import rest_map
-from loopwright.pipeline.models.identified.stability import stability_figures
+from loopwright.pipeline.models.identified.steady_states import rest_map, stability_figures
 
 
 def figures(model: Dynamics, rows: int = 400) -> dict[str, object]:

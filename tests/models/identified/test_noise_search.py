@@ -19,8 +19,7 @@ from loopwright.pipeline.models.identified.noise_search import NoiseSearch
 from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.rounds import Rounds
 from loopwright.pipeline.models.identified.scaled_record import Fold
-from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure
-from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure, Trial
 from loopwright.pipeline.models.part import Learnt, Source
 
 QUICK = IdentifiedPart(units=(), orders=(2, 3))

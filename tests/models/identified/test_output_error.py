@@ -11,16 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg
 
-from loopwright.pipeline.models.identified import dynamics, sensitivities
+from loopwright.pipeline.models.identified import dynamics, output_error
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.output_error import (
+    CHUNK,
+    Equations,
     OutputError,
     fit_starts,
     free_run_error,
     residuals,
+    sensitivity_sums,
     squares,
 )
-from loopwright.pipeline.models.identified.sensitivities import CHUNK, Equations, sensitivity_sums
 
 
 def drawn(n_y: int, n_v: int, n_x: int, n_hidden: int, seed: int) -> Dynamics:
@@ -193,7 +195,7 @@ def test_a_model_of_another_layout_in_memory_is_not_compiled_anew(monkeypatch: p
     turned = replace(plain, **{name: np.asfortranarray(getattr(plain, name)) for name in ("a", "b", "w1", "w2")})
     data, every = stretch(plain, 1, 50, 1, 0.1), np.ones(len(plain.vector()), dtype=bool)
     layouts = set()
-    for place, name in ((sensitivities, "propagate"), (dynamics, "hold_inputs"), (dynamics, "run_rows")):
+    for place, name in ((output_error, "propagate"), (dynamics, "hold_inputs"), (dynamics, "run_rows")):
         loop = getattr(place, name)
 
         def noted(*given: object, name: str = name, loop: Callable[..., object] = loop) -> object:

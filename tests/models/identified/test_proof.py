@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from closed_loop_records import OperatedLoop
 
-from loopwright.pipeline.models.identified.proof import Answer, Region, answers, proof_figures
+from loopwright.pipeline.models.identified.model_validation import Answer, Region, answers, proof_figures
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.structure import Structure
 

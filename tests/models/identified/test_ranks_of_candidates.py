@@ -17,9 +17,8 @@ from loopwright.pipeline.models.identified.noise_search import NoiseSearch
 from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.rounds import Rounds
 from loopwright.pipeline.models.identified.scaled_record import Fold
-from loopwright.pipeline.models.identified.selection import _as_its_linear_model, _settling_first, by_innovations
-from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure
-from loopwright.pipeline.models.identified.trial import Trial
+from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure, Trial
+from loopwright.pipeline.models.identified.structure_search import _as_its_linear_model, _settling_first, by_innovations
 
 STRUCTURE = Structure("balanced", 1, (0, 0), (0,))
 

@@ -6,8 +6,7 @@ import made_plants
 import numpy as np
 
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
-from loopwright.pipeline.models.identified.row_convention import may_act_in_its_row
-from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, may_act_in_its_row
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
 

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from loopwright.pipeline.models.identified.selection import Selection
+from loopwright.pipeline.models.identified.structure_search import Selection
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,8 @@ import pytest
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
 from loopwright.pipeline.models.identified.rounds import Rounds
-from loopwright.pipeline.models.identified.structure import Budget, Structure
+from loopwright.pipeline.models.identified.structure import Budget, Structure, Trial
 from loopwright.pipeline.models.identified.structure_search import Searched
-from loopwright.pipeline.models.identified.trial import Trial
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
 

@@ -7,7 +7,7 @@ import pytest
 
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.output_error import OutputError, fit_starts
-from loopwright.pipeline.models.identified.uncertainty import drawn
+from loopwright.pipeline.models.identified.parameter_uncertainty import drawn
 
 TRUE = Dynamics.linear(np.array([[0.9]]), np.array([[0.2]]))
 ROWS = 3000

@@ -1,0 +1,155 @@
+"""How long an identified model takes to settle, and whether a horizon reaches as far as it answers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.simulator import Array
+
+# ------------------------------------------------------------------------------------------------------------ settling
+LEVELS = (-0.8, -0.4, 0.0, 0.4, 0.8)  # of an MV in its range -1..1, the others in the middle of theirs
+STEP = 0.3  # of an MV, up and down
+BEFORE, AFTER = 200, 150  # samples at each level, and after the step
+BAND = 0.1  # share of the whole answer within which it has settled
+LEAST_ANSWER = 0.02  # share of the largest answer of an output; smaller ones have no settling time
+STEADY = 0.9  # share of its slope before that an output keeps which never comes to rest
+TINY = 1e-12
+SHARE = 0.9  # of the steps that the horizon is long enough for
+SHORTEST, LONGEST = 12, 50
+EXPLODED = 100.0  # scaled; a state this large that grows on fourfold in half of BEFORE comes from an unstable model
+
+
+def mvs_of(model: Identified, middle: Tensor, half: Tensor) -> Callable[[Tensor], Tensor]:
+    """The scaled MVs (..., n_mv) of the model for MVs within -1..1, of ranges middle +- half [mv]."""
+    center, scale = model.v_center[: model.n_mv], model.v_scale[: model.n_mv]
+    return lambda z: (middle + half * z - center) / scale
+
+
+@torch.no_grad()
+def horizon_for(model: Identified, mv_of: Callable[[Tensor], Tensor]) -> int:
+    """Samples in which 90 % of the model's step responses over its range settle to 10 %, within 12 to 50.
+
+    ``mv_of`` gives the scaled MVs (..., n_mv) of the model for MVs within -1..1. LawError for an unstable model.
+    """
+    settling = settling_times(step_responses(model, mv_of))
+    wanted = np.quantile(settling, SHARE) if settling.size else SHORTEST
+    return int(np.clip(np.ceil(wanted), SHORTEST, LONGEST))
+
+
+@torch.no_grad()
+def step_responses(model: Identified, mv_of: Callable[[Tensor], Tensor]) -> Array:
+    """Scaled outputs (runs, AFTER + 1, n_y) from the sample of a step on, of every MV at every level, both ways."""
+    refuse_unstable(model)
+    steps = [(i, at, by) for i in range(model.n_mv) for at in LEVELS for by in (STEP, -STEP) if abs(at + by) <= 1]
+    z = torch.zeros(len(steps), model.n_mv, dtype=torch.float64)
+    moved = z.clone()
+    for run, (i, at, by) in enumerate(steps):
+        z[run, i], moved[run, i] = at, at + by
+    x = torch.zeros(len(steps), model.n_x, dtype=torch.float64)
+    halfway = x
+    for k in range(BEFORE):
+        x, halfway = advanced(model, x, mv_of(z)), x if k == BEFORE // 2 else halfway
+    end, before = (float(t.abs().max()) for t in (x, halfway))
+    if not end < max(EXPLODED, 4 * before):
+        raise LawError(
+            f"law 'predictive': the identified model is unstable, its states grow from {before:.3g} to {end:.3g} under "
+            "constant MVs (they must settle, or grow evenly as a level does); identify it again with longer free runs"
+        )
+    y = [x[:, : model.n_y]]
+    for _ in range(AFTER):
+        x = advanced(model, x, mv_of(moved))
+        y.append(x[:, : model.n_y])
+    return torch.stack(y, dim=1).numpy()
+
+
+def settling_times(responses: Array) -> Array:
+    """Samples (answers,) until each answer stays within BAND of its end, of responses (runs, n, n_y).
+
+    An output that a step hardly moves has no answer. One that goes on and on, as a level, settles twice as late as it
+    first moves as fast as later on: so long it takes to set it moving, and to stop it.
+    """
+    change = responses[:, -1] - responses[:, 0]  # (runs, n_y)
+    away = np.abs(responses - responses[:, -1:]) > BAND * np.abs(change)[:, None]
+    last = np.where(away, np.arange(responses.shape[1])[:, None], -1).max(axis=1) + 1
+    slope = np.abs(np.diff(responses, axis=1))  # (runs, n - 1, n_y)
+    begun, middle, end = (np.median(part, axis=1) for part in np.array_split(slope, 3, axis=1))
+    goes_on = np.median(end / np.maximum(middle, TINY), axis=0) > STEADY  # (n_y,)
+    moving = 2 * (slope >= (1 - BAND) * begun[:, None]).argmax(axis=1) + 2
+    found = np.where(goes_on, moving, last)
+    return np.asarray(found[np.abs(change) > LEAST_ANSWER * np.abs(change).max(axis=0)], dtype=np.float64)
+
+
+def advanced(model: Identified, x: Tensor, mv: Tensor) -> Tensor:
+    """The next states (runs, n_x) under scaled MVs (runs, n_mv), measured disturbances at their centre."""
+    v = torch.cat([mv, torch.zeros(len(mv), model.n_dv, dtype=torch.float64)], dim=-1)
+    y: Tensor = model(torch.cat([x, v * model.v_scale + model.v_center], dim=-1))
+    return y
+
+
+def refuse_unstable(model: Identified) -> None:
+    """LawError for a linear model with a pole outside the unit circle; a level's pole at 1 is allowed."""
+    pole = float(torch.linalg.eigvals(model.a).abs().max())
+    if model.n_hidden == 0 and pole > 1 + 1e-6:
+        raise LawError(
+            f"law 'predictive': the identified model is unstable, its largest pole is {pole:.6g} (at most 1 is "
+            "allowed): a free run over the horizon says nothing; identify it again with a stable linear part"
+        )
+
+
+# ------------------------------------------------------------------------------------------------ reach of the horizon
+BEGUN = 0.01  # share of the change within AFTER samples, from which an answer has begun
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """Samples after a step of an MV: the first answer of the CV that answers last, and the settling of the answers."""
+
+    first: int  # AFTER + 1 where none is there by then
+    settles: int
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, model: Identified, mv_of: Callable[[Tensor], Tensor], n_cv: int) -> Sight:
+        """From the model's step responses; ``mv_of`` as in ``horizon_for``."""
+        responses = step_responses(model, mv_of)
+        settling = settling_times(responses)
+        settles = int(np.ceil(np.quantile(settling, SHARE))) if settling.size else 0
+        # At the inner levels each step is made up and down; their difference knows nothing of what came before.
+        paired = responses.reshape(model.n_mv, -1, *responses.shape[1:])[:, 1:-1]
+        apart = (paired[:, ::2] - paired[:, 1::2]).reshape(-1, *responses.shape[1:])
+        return cls(max(_first(y) for y in np.moveaxis(apart, -1, 0)[:n_cv]), settles)
+
+    def require(self, horizon: int) -> None:
+        """LawError where the horizon ends before the first answer: the law would see no effect of its moves."""
+        if self.first > horizon:
+            after = f"only {self.first}" if self.first <= AFTER else f"more than {AFTER}"
+            raise LawError(
+                f"law 'predictive' looks {horizon} samples ahead, and a controlled variable answers {after} samples "
+                "after the MVs move: choose a longer sampling period, or a longer `horizon`"
+            )
+
+    def notes(self, horizon: int) -> tuple[str, ...]:
+        """The words of a report on a horizon that ends before half of the answers' settling after the dead time."""
+        wanted = (self.first + self.settles) / 2
+        if horizon >= wanted:
+            return ()
+        return (
+            f"The law looks {horizon} samples ahead. By the model the controlled variables answer after {self.first} "
+            f"and take {self.settles} samples or more to settle over the MVs' whole range: the plan ends before they "
+            "have come half of that time. With a longer horizon or a longer sampling period it sees more.",
+        )
+
+
+def _first(y: Array) -> int:
+    """The first sample in which an output answers to any step, of responses (runs, n)."""
+    moved = np.abs(y - y[:, :1])
+    change = moved.max(axis=1, keepdims=True)
+    clear = (moved > BEGUN * change) & (change >= LEAST_ANSWER * change.max()) & (change > 0)
+    return int(np.argmax(clear.any(axis=0))) if clear.any() else AFTER + 1

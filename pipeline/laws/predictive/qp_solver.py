@@ -1,0 +1,137 @@
+"""A plan over a horizon: Gauss-Newton passes, each with a box QP by a fixed number of sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import hardtanh
+
+from loopwright.pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, NetworkHorizon, product
+from loopwright.pipeline.laws.predictive.move_blocking import Moves
+from loopwright.pipeline.laws.predictive.set_points import SoftLimits
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Numbers of the cost: ``weights`` q of the CVs, ``move`` mu of a squared change, ``eps``; and the ``damping``.
+
+    All for outputs and MVs in scaled units.
+    """
+
+    weights: Sequence[float]
+    move: float
+    eps: float
+    damping: float = 0.0
+
+
+class Planner(nn.Module):
+    """The plan z that is best over the horizon.
+
+        min  sum_k sum_o q_o sqrt((y_o(k) - r_o(k))^2 + eps^2) + mu sum_j |z_j - z_{j-1}|^2,   |z| <= 1
+
+    z_0 is the applied MV. Each pass takes the free run y and its slopes S at the present plan, the weights
+    w = q/sqrt(e^2 + eps^2) of the errors e = y - r, and the plan that is best for the quadratic cost
+
+        sum w (e + S dz)^2/2 + mu sum_j |z_j - z_{j-1}|^2 + kappa sum_p H_pp dz_p^2/2
+
+    within its bounds, by ``sweeps`` rounds of coordinate descent; H_pp is the curvature of the other terms. A fixed
+    point is a minimum of the cost itself, whatever the damping kappa. Without damping full steps over a strongly bent
+    model can throw the plan from pass to pass, and the loop then amplifies rounding. An error counts by its size, not
+    by its square: large ones do not decide alone. With ``rate`` (n_mv,) each move differs from the one before by at
+    most its length in samples times the rate. The cost of ``limits`` is added, by a quadratic of the same kind; no
+    quadratic stands for a limit that the present plan keeps, so that it does not slow down the approach.
+
+    Source: iteratively reweighted least squares, Huber, Robust Statistics, section 7.8; coordinate descent, Wright,
+    Mathematical Programming 151 (2015) 3.
+    """
+
+    rate: Tensor | None  # (1, m) largest difference from the move before
+    weights: Tensor  # (1, N n_cv)
+    moved: Tensor  # (m, m) curvature of the moves' cost
+    applied: Tensor  # (n_mv, m) slope of the moves' cost over the applied MV
+    first: Tensor  # (n_mv, m)
+    before: Tensor  # (m, m)
+    columns: Tensor  # (m, m, m) ones in column p of matrix p
+    eye: Tensor  # (m, m)
+    stiff: Tensor  # (m, m) ones, and 1 + kappa on the diagonal
+    damping: Tensor  # (1,) kappa
+
+    def __init__(
+        self,
+        horizon: LinearHorizon | NetworkHorizon,
+        moves: Moves,
+        cost: Cost,
+        passes: int,
+        sweeps: int,
+        rate: Tensor | None = None,
+        limits: SoftLimits | None = None,
+    ) -> None:
+        super().__init__()
+        self.limits = limits
+        self.horizon, self.passes, self.sweeps, self.m = horizon, passes, sweeps, moves.count
+        self.n_cv = len(cost.weights)
+        first, eye = torch.from_numpy(moves.first), torch.eye(moves.count, dtype=torch.float64)
+        buffers = {
+            "rate": None if rate is None else rate.repeat(len(moves.starts)) * torch.from_numpy(moves.lengths),
+            "moved": 2 * cost.move * torch.from_numpy(moves.curvature),
+            "applied": 2 * cost.move * first,
+            "first": first,
+            "before": torch.from_numpy(moves.before),
+            "columns": eye.unsqueeze(-2).repeat(1, self.m, 1),
+            "eye": eye,
+            "stiff": 1.0 + cost.damping * eye,
+        }
+        for name, values in buffers.items():
+            self.register_buffer(name, values)
+        hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2, damping=cost.damping)
+
+    def forward(self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
+        """The plan (..., 1, m), and the outputs (..., 1, n_cv) that it gives at the next sample.
+
+        From ``start`` (..., 1, n_x + n_y + n_dv), with the set points ``wanted`` (..., 1, N n_cv) over the horizon,
+        the ``applied`` MV (..., 1, n_mv) within -1..1, beginning at ``plan``; all scaled.
+        """
+        n_cv = self.n_cv
+        held, at = applied @ self.applied, applied @ self.first
+        for _ in range(self.passes):
+            run = self.horizon(start, plan)
+            error = run.y - wanted
+            weight = self.weights / torch.sqrt(error * error + self.eps_squared)
+            push = None if self.limits is None else self.limits(run.y)
+            both = weight if push is None else weight + push.weight
+            curvature = product(run.slopes * both, run.slopes_t, self.moved)
+            moved = plan @ run.slopes
+            back = weight * (moved - error) if push is None else both * moved - weight * error - push.slope
+            pull = product(back, run.slopes_t, held)
+            before = plan
+            diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
+            plan = self.descended(curvature * self.stiff, pull + self.damping * diagonal * plan, plan, at)
+        ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
+        return plan, ahead
+
+    def descended(self, curvature: Tensor, pull: Tensor, plan: Tensor, at: Tensor) -> Tensor:
+        """The minimum of z'Hz/2 - pull z within the bounds, from ``plan``: H (..., m, m), the others (..., 1, m).
+
+        Coordinate p is z_p = (pull_p - sum_{q != p} H_pq z_q)/H_pp, cut to its bounds. Written for the whole row
+        that is z G_p + c_p, where only column p of G_p is not the identity's.
+        """
+        m = self.m
+        diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
+        g = self.eye - (curvature / diagonal).unsqueeze(-3) * self.columns
+        c = self.eye * (pull / diagonal)
+        into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
+        add = torch.split(c, 1, dim=-2)
+        for _ in range(self.sweeps):
+            if self.rate is None:
+                for p in range(m):
+                    plan = hardtanh(product(plan, into[p], add[p]))
+                continue
+            middle = product(plan, self.before, at)
+            low, high = (torch.clamp(end, -1.0, 1.0) for end in (middle - self.rate, middle + self.rate))
+            for p in range(m):
+                plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
+        return plan

@@ -1,0 +1,371 @@
+"""Whether the record proves the model that was fitted to it: its answers beside one-step predictions, its free run.
+
+All tests of an own plant run on models of one record. Where that record shows the controller more than the plant, all
+of them are wrong together, and the tests are met. So the answers of the model to its MVs are compared with those that
+``DirectModel`` reads from the same rows, and with those of each half of them. Where a gain turns its sign inside the
+range, or fades, they are compared region by region.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopwright.pipeline.config.known import SURE
+from loopwright.pipeline.historian.answers import DirectModel
+from loopwright.pipeline.historian.feedback import follows
+from loopwright.pipeline.models.identified.innovations import innovations
+from loopwright.pipeline.models.identified.linear_start import high_order_arx
+from loopwright.pipeline.models.identified.regions import SMALL, Cells, alike, pieces
+from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
+from loopwright.pipeline.models.identified.structure import Problem, Structure, Trial
+from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.records.record import Record
+
+PROVEN, UNCERTAIN, OPPOSITE, HALVES, SIZE = "proven", "uncertain", "opposite", "halves", "size"
+TURNS, FADES = "turns", "fades"  # what holds by its regions
+CONTRARY = 2.0  # of a half of the rows, from which it speaks for the other sign
+TIMES = 3.0  # the model's answer over the one-step prediction's, or the other way round, where both are certain
+USED = 0.25  # of a PV's strongest answer to an MV over its range: a weaker one decides nothing
+LOOKED_AT, SEEN = 60, 240  # rows after a step: of the comparison, and in which an answer begins
+LEAST_LAGS = 40  # of one-step predictions
+BEGINS, HALF, MOST = 0.02, 0.5, 0.9  # of an answer
+LEFT_OUT = 0.05  # of the models' weight, at either end of their answers: one poor model of many vetoes nothing
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """How a PV answers to an MV, in PV/MV: the mean over the rows ``first`` to ``last`` after a step.
+
+    ``model`` is the fitted model's, ``low`` and ``high`` the ends over the models as likely as it; ``direct`` with the
+    standard deviation ``sd`` is read from one-step predictions, ``halves`` the same of each half of the rows, in
+    standard deviations of its own. None where there are too few rows. ``regions`` of the MV's range, from low to high,
+    are there where the models' gain turns its sign or fades within it.
+    """
+
+    model: float
+    low: float
+    high: float
+    first: int
+    last: int
+    direct: float | None = None
+    sd: float | None = None
+    halves: tuple[float, ...] = ()
+    regions: tuple[Region, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """``proven``, or what speaks against it: ``uncertain``, ``opposite``, ``halves``, ``size``.
+
+        ``turns`` or ``fades`` where something speaks against the mean answer, but in no region against that of the
+        region: it is proven or uncertain there. A proven mean does not outweigh a region of the other sign.
+        """
+        told = [region for region in self.regions if not region.small]
+        against = [r.answer.verdict for r in told if r.answer.verdict in {OPPOSITE, HALVES}]
+        if self._of_all == PROVEN:
+            return against[0] if against else PROVEN
+        if not told or any(r.answer.verdict not in {PROVEN, UNCERTAIN} for r in told):
+            return self._of_all
+        return TURNS if min(r.answer.model for r in told) < 0 < max(r.answer.model for r in told) else FADES
+
+    @property
+    def _of_all(self) -> str:
+        if self.direct is None or self.sd is None or abs(self.direct) < SURE * self.sd or self.low * self.high <= 0:
+            return UNCERTAIN
+        if self.direct * self.model <= 0:
+            return OPPOSITE
+        if any(np.sign(self.direct) * t < -CONTRARY for t in self.halves):
+            return HALVES
+        near = abs(self.model - self.direct) <= SURE * self.sd
+        return PROVEN if near or 1 / TIMES <= self.model / self.direct <= TIMES else SIZE
+
+    def times(self, unit: float, scale: float = 1.0, center: float = 0.0) -> Answer:
+        """The same in another unit; values of the MV times ``scale`` plus ``center``."""
+        model, low, high = (value * unit for value in (self.model, self.low, self.high))
+        direct, sd = (None if value is None else value * unit for value in (self.direct, self.sd))
+        regions = tuple(
+            Region(r.start * scale + center, r.end * scale + center, r.small, r.answer.times(unit))
+            for r in self.regions
+        )
+        return replace(self, model=model, low=low, high=high, direct=direct, sd=sd, regions=regions)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready."""
+        found = {**asdict(self), "halves": list(self.halves), "verdict": self.verdict}
+        found["regions"] = [
+            {"from": r.start, "to": r.end, "small": r.small, **r.answer.to_dict()} for r in self.regions
+        ]
+        return {name: value for name, value in found.items() if name != "regions" or value}
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """The answer while the MV moves between two values; ``small`` beside other regions it decides nothing."""
+
+    start: float
+    end: float
+    small: bool
+    answer: Answer
+
+
+def answers(
+    curves: Array,
+    structure: Structure,
+    fitted: ScaledRecord,
+    size: Array,
+    n_mv: int,
+    cells: Cells | None = None,
+    weights: Array | None = None,
+) -> tuple[dict[tuple[int, int], Answer], Array]:
+    """((output, MV) -> answer, scaled, of the answers that a controller uses; error of one-step predictions (n_y,)).
+
+    ``curves`` (members, n_v, length, n_y) are the answers of the models to steps of ``size`` (n_v,) scaled; the first
+    value of input j comes ``structure.delays[j]`` and one rows after the step. ``fitted`` are the rows of the fit, each
+    input in its own row. ``cells`` are the same models' answers in cells of the MVs' ranges, for models whose gain
+    changes; ``weights`` (members,) how likely they are, None: all alike.
+    """
+    unit = curves / size[None, :, None, None]
+    weights = np.ones(len(unit)) if weights is None else weights
+    middle = np.median(unit, axis=0)
+    reach = np.abs(middle[:n_mv]).max(axis=1)  # (n_mv, n_y); scaled, an MV's range is the same for all
+    ways = [] if cells is None else [_weighed(of, weights)[1] for of in cells.curves]  # (cells, length, n_y) of each MV
+    if ways:
+        reach = np.maximum(reach, [np.abs(of).max(axis=(0, 1)) for of in ways])
+    halves = np.array_split(np.arange(len(fitted)), 2)
+    parts = [fitted, *(fitted.rows(slice(int(of[0]), int(of[-1]) + 1)) for of in halves)]
+    found: dict[tuple[int, int], Answer] = {}
+    surprise = np.full(curves.shape[3], np.inf)
+    for i in range(curves.shape[3]):
+        used = [j for j in range(n_mv) if reach[j, i] >= USED * reach[:, i].max()]
+        late = {j: 1 + structure.delays[j] - int(structure.same_row) for j in used}
+        places = {j: _place(middle[j, :, i], late[j]) for j in used}
+        longest = max([LEAST_LAGS, *(last for *_, last in places.values())])
+        direct = [DirectModel.of(part.y[:, i], part.v, part.run, longest) for part in parts]
+        surprise[i] = np.inf if direct[0] is None else direct[0].sd
+        for j, (at, first, last) in places.items():
+            found[i, j] = _answer(unit[:, j, at, i].mean(axis=1), weights, direct, j, first, last)
+        if cells is not None:
+            of_ways = {j: (cells.edges[j], cells.curves[j][..., i], ways[j][..., i], late[j]) for j in used}
+            for j, regions in _regions(of_ways, weights, parts, i).items():
+                found[i, j] = replace(found[i, j], regions=regions)
+    return found, surprise
+
+
+def _regions(
+    ways: Mapping[int, tuple[Array, Array, Array, int]], weights: Array, parts: Sequence[ScaledRecord], i: int
+) -> dict[int, tuple[Region, ...]]:
+    """MV -> its regions, of those over which the gain of output i turns its sign or fades.
+
+    ``ways``: MV -> (edges of its cells, the models' curves over them (members, cells, length), their middle, row of the
+    first point). The one-step predictions of the rows ``parts`` have a gain for each region.
+    """
+    cut = {}
+    for j, (edges, curves, middle, late) in ways.items():
+        strongest = int(np.abs(middle).max(axis=1).argmax())
+        at, first, last = _place(middle[strongest], late)
+        of_cells = curves[:, :, at].mean(axis=2)
+        if groups := alike(_weighed(of_cells, weights)[1]):
+            cut[j] = (groups, edges, of_cells, first, last)
+    if not cut:
+        return {}
+    longest = max([LEAST_LAGS, *(last for *_, last in cut.values())])
+    models, columns = [], dict[int, int]()
+    for part in parts:
+        inputs: list[Array] = []
+        for j, values in enumerate(part.v.T):
+            columns[j] = sum(of.shape[1] for of in inputs)
+            knots = [cut[j][1][group.start] for group in cut[j][0][1:]] if j in cut else []
+            inputs.append(pieces(values, knots))
+        models.append(DirectModel.of(part.y[:, i], np.hstack(inputs), part.run, longest))
+    found = {}
+    for j, (groups, edges, of_cells, first, last) in cut.items():
+        width, strongest = np.diff(edges), np.abs(_weighed(of_cells, weights)[1]).max()
+        regions = []
+        for k, of in enumerate(groups):
+            mean = of_cells[:, of] @ width[of] / width[of].sum()
+            answer = _answer(mean, weights, models, columns[j] + k, first, last)
+            # What the model finds small is so if one-step predictions are not certain that it is not.
+            sure = 0.0 if answer.direct is None or answer.sd is None else abs(answer.direct) - SURE * answer.sd
+            small = abs(answer.model) < SMALL * strongest and sure < TIMES * SMALL * strongest
+            regions.append(Region(float(edges[of.start]), float(edges[of.stop]), bool(small), answer))
+        found[j] = tuple(regions)
+    return found
+
+
+def _weighed(values: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """(low, middle, high) of values (members, ...) with weights (members,), ``LEFT_OUT`` of the weight at either end.
+
+    Weights that are all alike leave the least and the largest of few values, and their median.
+    """
+    order = np.argsort(values, axis=0, kind="stable")
+    ranked, share = np.take_along_axis(values, order, axis=0), np.cumsum(weights[order], axis=0) / weights.sum()
+
+    def first(reached: NDArray[np.bool_]) -> Array:
+        at = np.where(reached.any(axis=0), reached.argmax(axis=0), len(values) - 1)
+        return np.asarray(np.take_along_axis(ranked, at[None], axis=0)[0])
+
+    near = 1e-9  # of rounding
+    low, high = (first(share > end) for end in (LEFT_OUT + near, 1 - LEFT_OUT - near))
+    middle = 0.5 * (first(share > 0.5 - near) + first(share > 0.5 + near))
+    return low, middle, high
+
+
+def _place(curve: Array, late: int) -> tuple[slice, int, int]:
+    """(points of a curve, their first row, their last row) in which an answer goes from HALF to MOST of its largest.
+
+    ``late`` is the row of the first point. Rows before the first that a past MV can move count as that one.
+    """
+    size = np.abs(curve)
+    begins = int((size >= BEGINS * size[:SEEN].max()).argmax())
+    size = size[: max(LOOKED_AT, 2 * begins)]
+    first, last = (int((size >= share * size.max()).argmax()) for share in (HALF, MOST))
+    last = max(first, last)
+    return slice(first, last + 1), max(first + late, 1), max(last + late, 1)
+
+
+def _answer(
+    of_models: Array, weights: Array, direct: Sequence[DirectModel | None], j: int, first: int, last: int
+) -> Answer:
+    low, model, high = map(float, _weighed(of_models, weights))
+    whole, *halves = (None if model is None else model.answer(j, first, last) for model in direct)
+    if whole is None:
+        return Answer(model, low, high, first, last)
+    known = tuple(value / sd for value, sd in (half for half in halves if half is not None))
+    return Answer(model, low, high, first, last, whole[0], whole[1], known)
+
+
+def foreseen(problem: Problem, chosen: Trial, names: Sequence[str], y_scale: Array) -> dict[str, dict[str, float]]:
+    """PV -> what the inputs foresee of it over rows that no fit saw: one-step errors [PV] with and without them.
+
+    ``with_inputs`` and ``without`` are rms errors of two ARX alike, one of all signals, one of the PVs alone; ``model``
+    is that of the model with its noise, ``rows`` their number, and ``nats`` the log-likelihood that the inputs gain.
+    Where the MVs move by the PVs alone, or by nothing that has to do with them, they gain none.
+    """
+    parts, n_y = [], problem.data.y.shape[1]
+    for k, fold in enumerate(problem.folds):
+        rows = problem.part(chosen.structure, slice(None))
+        alone = replace(rows, v=rows.v[:, :0])
+        model = chosen.of_fold(k)[0].model
+        errors = innovations(model, problem.held(chosen.structure, k))
+        both = [high_order_arx(of.rows(fold.train)).one_step_errors(of.rows(fold.held)) for of in (rows, alone)]
+        parts.append([np.full((1, n_y), np.inf) if errors is None else errors, *both])
+    found = [np.concatenate(of) for of in zip(*parts, strict=True)]
+    model_sd, with_sd, without_sd = (np.sqrt(np.mean(e**2, axis=0)) for e in found)
+    n = len(found[2])
+    return {
+        name: {
+            "model": float(model_sd[i] * y_scale[i]),
+            "with_inputs": float(with_sd[i] * y_scale[i]),
+            "without": float(without_sd[i] * y_scale[i]),
+            "rows": n,
+            "nats": float(n * np.log(without_sd[i] / with_sd[i])),
+        }
+        for i, name in enumerate(names)
+    }
+
+
+def proof_figures(
+    found: Mapping[tuple[int, int], Answer],
+    record: Record,
+    scales: Scales,
+    free_runs: Sequence[Mapping[str, Mapping[str, Any]]],
+    noise: Array,
+) -> dict[str, Any]:
+    """``answers``: PV -> MV -> ``Answer`` in PV/MV, with the share of the MV's moves that the PV's past explains.
+
+    ``free_run``: PV -> what the model misses over rows that its fit never saw, and how far the PV moved there, both
+    beyond the ``noise`` (n_y,), in the PV's unit; of ``free_runs``, one a fold, together. ``share`` is the free run's
+    error over the PV's deviation, noise and all: a model without the inputs has 1.
+    """
+    table: dict[str, Any] = {s.name: {} for s in record.pv_signals[: len(scales.y_scale)]}
+    for (i, j), answer in found.items():
+        pv, mv, unit = record.pv_signals[i], record.mv_signals[j], scales.y_scale[i] / scales.v_scale[j]
+        share = follows(record.mv[:, j], record.pv[:, i], record.run)
+        told = answer.times(float(unit), float(scales.v_scale[j]), float(scales.v_center[j]))
+        table[pv.name][mv.name] = {**told.to_dict(), "follows": share}
+    runs = {}
+    for i, name in enumerate(table):
+        error, moved = (
+            float(np.sqrt(np.mean([of[name][figure] ** 2 for of in free_runs])))
+            for figure in ("free_run_rmse", "held_sd")
+        )
+        missed, motion = (float(np.sqrt(max(value**2 - noise[i] ** 2, 0.0))) for value in (error, moved))
+        known = bool(np.isfinite(missed) and moved > 0)
+        runs[name] = {
+            "missed": missed if np.isfinite(missed) else None,
+            "motion": motion,
+            "share": error / moved if known else None,
+        }
+    return {"answers": table, "free_run": runs}
+
+
+# ---------------------------------------------------- a controller of several loops beside a few answers that are open
+MOST_OPEN = 8  # answers that are open together
+DIRECTIONS = 2_000  # in which the plants that a record leaves open are looked at in each round
+NEARER = (1.0, 0.3, 0.1, 0.03)  # how far the directions of a round lie about the worst one of the rounds before
+
+
+def unused_answers(
+    answers: Mapping[tuple[int, int], Answer], unit: Array, structure: Structure, shape: tuple[int, int]
+) -> Array:
+    """Answers (n_cv, n_mv), scaled, of the pairs that no controller uses, 0 of the others.
+
+    ``unit`` (n_v, length, n_y) are the model's answers to unit steps. Each is the mean over the rows of the strongest
+    answer of its output, so that all of one output are of one age.
+    """
+    found = np.zeros(shape)
+    for i in range(shape[0]):
+        used = {j: answer for (of, j), answer in answers.items() if of == i}
+        if not used:
+            continue
+        strongest = max(used.values(), key=lambda answer: abs(answer.model))
+        for j in set(range(shape[1])) - set(used):
+            late = 1 + structure.delays[j] - int(structure.same_row)  # row of the first point
+            first, last = (max(row - late, 0) for row in (strongest.first, strongest.last))
+            found[i, j] = unit[j, first : last + 1, i].mean() if strongest.last >= late else 0.0
+    return found
+
+
+def sign_margin(answers: Mapping[tuple[int, int], Answer], rest: Array, sds: float) -> float:
+    """The least that integral action on the model's gains G is worth on plants G' that the record leaves open.
+
+        min Re eig(G' G^+)
+
+    over the uncertain answers that are together ``sds`` standard deviations off those of one-step predictions,
+
+        sum_i (g'_i - g_i)^2 / sd_i^2 = sds^2
+
+    all others as the model has them. 1 where none is uncertain. Above zero slow integral action whose moves are G^+ of
+    the errors is stable on each of these plants; below it runs away on one. All answers at their ends at once would be
+    far less likely than one alone. ``rest`` (n_y, n_mv) holds the
+    answers that no controller uses. Minus infinity where one-step predictions find no number, or more than
+    ``MOST_OPEN`` answers are open.
+
+    Source: M. Morari, E. Zafiriou, Robust Process Control, 1989, section 14.3 (integral controllability).
+    """
+    gains = rest.copy()
+    for place, answer in answers.items():
+        gains[place] = answer.model
+    uncertain = [(place, a) for place, a in answers.items() if a.verdict == UNCERTAIN]
+    open_to = [(place, a.direct, sds * a.sd) for place, a in uncertain if a.direct is not None and a.sd is not None]
+    if len(open_to) < len(uncertain) or len(open_to) > MOST_OPEN or not np.all(np.isfinite(gains)):
+        return -np.inf
+    if not open_to:
+        return 1.0
+    inverse, plants, rng = np.linalg.pinv(gains), np.tile(gains, (DIRECTIONS, 1, 1)), np.random.default_rng(0)
+    least, worst = 1.0, np.zeros(len(open_to))
+    for aside in NEARER:
+        ways = worst + aside * rng.normal(size=(DIRECTIONS, len(open_to)))
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        for way, ((i, j), direct, width) in zip(ways.T, open_to, strict=True):
+            plants[:, i, j] = direct + way * width
+        # Of more outputs than MVs only as many can be held: the others have eigenvalues of zero.
+        found = np.linalg.eigvals(inverse @ plants if gains.shape[0] > gains.shape[1] else plants @ inverse)
+        margins = found.real.min(axis=1)
+        if margins.min() < least:
+            least, worst = float(margins.min()), ways[margins.argmin()]
+    return least

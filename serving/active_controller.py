@@ -1,0 +1,264 @@
+"""The controller that has the plant, and the one on trial beside it; a loop may read more signals than either does."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopwright.serving.controller import Controller, Step
+from loopwright.serving.errors import ContractError, LoopError
+from loopwright.serving.guard import Guard, Sample, refused
+from loopwright.serving.manifest import INPUTS, Manifest, Signal
+from loopwright.serving.words import named
+
+# ---------------------------------------------------------------------- a controller in a loop that reads more signals
+Array: TypeAlias = NDArray[np.float64]
+
+
+class Fitted(Controller):
+    """A controller that gets its own PVs and measured disturbances out of a loop's, by name.
+
+    Its ``manifest`` has all signals of the loop, so that whoever reads, judges, shows or writes down a scan does so as
+    before; those that the controller reads have the ranges for which it was proven, and the MVs those of the actuator.
+    ``inner`` is the controller itself, whose MVs may have narrower ones: from where an MV stands outside of them it
+    goes there by its largest move a period.
+    """
+
+    def __init__(self, inner: Controller, loop: Manifest) -> None:
+        own = inner.manifest
+        self.inner, self.manifest = inner, _seen_as(own, loop)
+        self.path, self.sha256 = inner.path, inner.sha256
+        self.size_bytes, self.summary = inner.size_bytes, inner.summary
+        self._pv, self._dv = _places(own.pv, loop.pv), _places(own.dv, loop.dv)
+
+    def step(
+        self, *, sp: ArrayLike, pv: ArrayLike, mv_applied: ArrayLike, state: ArrayLike, dv: ArrayLike | None = None
+    ) -> Step:
+        """One step, on all PVs and measured disturbances of the loop."""
+        step = self.inner.step(
+            sp=sp,
+            pv=_picked(pv, self._pv, self.manifest.pv, "pv"),
+            mv_applied=mv_applied,
+            state=state,
+            dv=_picked(dv, self._dv, self.manifest.dv, "dv") if "dv" in self.inner.manifest.inputs else None,
+        )
+        applied = np.asarray(mv_applied, dtype=np.float64).reshape(step.mv.shape)
+        mv = [
+            s.toward(min(max(float(at), s.low), s.high), float(wanted))
+            for s, at, wanted in zip(self.manifest.mv, applied, step.mv, strict=True)
+        ]
+        return step._replace(mv=np.array(mv))
+
+    def warm(self) -> None:
+        """Compute a first step, as ``Controller.warm`` does."""
+        self.inner.warm()
+
+
+def fitted(controller: Controller, loop: Manifest) -> Controller:
+    """``controller`` for a loop that reads the signals of ``loop``: itself where it reads all of them.
+
+    LoopError where it cannot take over there: another period, a signal that the loop does not read, another order of
+    what it controls, other set points or MVs. The MVs' values must be the same, and their ranges within the loop's:
+    these belong to the actuator. The ranges of set points and PVs say where a controller was proven, and may be others.
+    """
+    require_fits(controller.manifest, loop)
+    return controller if _seen_as(controller.manifest, loop) == controller.manifest else Fitted(controller, loop)
+
+
+def require_fits(own: Manifest, loop: Manifest) -> None:
+    """LoopError where a controller of ``own`` cannot take over in a loop that reads ``loop``; see ``fitted``."""
+    differ = [*_basics(own, loop), *_steered(own, loop), *_measured(own, loop)]
+    if differ:
+        plants = f"the new controller (made for {own.case}) does not fit this loop (made for {loop.case})"
+        raise LoopError(f"{plants}: {'; '.join(differ)}")
+
+
+def _basics(own: Manifest, loop: Manifest) -> Iterator[str]:
+    if own.period_s != loop.period_s:
+        yield f"its period is {own.period_s:g} s, the loop's is {loop.period_s:g} s"
+    if "dv" in own.inputs and "dv" not in loop.inputs:
+        yield "it uses measured disturbances, which this loop does not judge; restart with it"
+
+
+def _steered(own: Manifest, loop: Manifest) -> Iterator[str]:
+    """Set points and MVs, which must be the same; MVs may have a part of the loop's range."""
+    if [_what(s) for s in own.sp] != [_what(s) for s in loop.sp]:
+        its, ours = _shown(own.sp), _shown(loop.sp)
+        yield f"its set points are {its}, the loop's are {ours}, and both must be the same in name, unit and order"
+    same = [(*_what(s), s.values) for s in own.mv] == [(*_what(s), s.values) for s in loop.mv]
+    if not (same and all(o.low <= s.low and s.high <= o.high for s, o in zip(own.mv, loop.mv, strict=True))):
+        yield (
+            f"its MVs are {_shown(own.mv)}, the loop's are {_shown(loop.mv)}, and both must be the same in name, unit, "
+            "values and order, with ranges within the loop's"
+        )
+
+
+def _measured(own: Manifest, loop: Manifest) -> Iterator[str]:
+    """PVs and measured disturbances, of which it may leave some out."""
+    controlled = len(loop.sp)
+    for name, words, first in (("pv", "PVs", controlled), ("dv", "measured disturbances", 0)):
+        ours, its = loop.signals(name), own.signals(name)
+        known = [_what(s) for s in ours]
+        if [_what(s) for s in its[:first]] != known[:first] or not {_what(s) for s in its} <= set(known):
+            order = ", and must begin with those that are controlled, in the same order" if first else ""
+            may = f"it may leave some of them out, but have no others{order}"
+            yield f"its {words} are {_shown(its)}, the loop's are {_shown(ours)}: {may}"
+
+
+def _seen_as(own: Manifest, loop: Manifest) -> Manifest:
+    """``own`` with all PVs and measured disturbances of the loop, which goes on judging them as it did."""
+    inputs = tuple(n for n in INPUTS if n in own.inputs or (n == "dv" and n in loop.inputs))
+    if set(inputs) == set(own.inputs):
+        inputs = own.inputs
+    mv = tuple(replace(s, low=o.low, high=o.high) for s, o in zip(own.mv, loop.mv, strict=True))
+    return replace(own, pv=_ranged(loop.pv, own.pv), mv=mv, dv=_ranged(loop.dv, own.dv), inputs=inputs)
+
+
+def _ranged(loop: Sequence[Signal], own: Sequence[Signal]) -> tuple[Signal, ...]:
+    known = {s.name: s for s in own}
+    return tuple(known.get(s.name, s) for s in loop)
+
+
+def _places(own: Sequence[Signal], loop: Sequence[Signal]) -> list[int]:
+    names = [s.name for s in loop]
+    return [names.index(s.name) for s in own]
+
+
+def _picked(values: ArrayLike | None, places: Sequence[int], loop: Sequence[Signal], name: str) -> Array:
+    vector = np.asarray(values)
+    if vector.shape != (len(loop),):
+        raise ContractError(f"{name} has the shape {vector.shape}; the loop has ({len(loop)},)")
+    return np.asarray(vector[places])
+
+
+def _what(s: Signal) -> tuple[object, ...]:
+    return s.name, s.unit
+
+
+def _shown(signals: Sequence[Signal]) -> str:
+    return ", ".join(f"{s.name} [{s.unit}] {s.low:g}..{s.high:g}" for s in signals) or "none"
+
+
+# -------------------------------------------------------------------------- a controller that is tried, and takes over
+
+
+class Successor:
+    """Steps a new controller on the samples of the one in charge; its MV is shown and not written.
+
+    It is ready after ``trial`` good scans in a row: a scan without a sample, one that its own ``guards`` refuse, or one
+    that it cannot compute, starts the count and its law anew.
+    """
+
+    def __init__(self, controller: Controller, trial: int, guards: Sequence[Guard] = ()) -> None:
+        self.controller, self.trial, self.guards = controller, trial, guards
+        self.state = controller.cold_state()
+        self.good = 0
+        self.mv: Array | None = None  # shape: (n_mv,), of the last scan; None where there is none
+        self.reason = ""  # why the last scan gave no MV
+
+    def step(self, sample: Sample, sp: Array, applied: Array, past: Collection[Sample] = ()) -> None:
+        """One scan; ``past`` ends with the sample before it."""
+        if reason := refused(self.guards, sample, past):
+            self.miss(reason)
+            return
+        for s, value in zip(self.controller.manifest.sp, sp.tolist(), strict=True):
+            if not s.low <= value <= s.high:
+                self.miss(f"the set point {s.name} = {value:g} is outside its range [{s.low:g}, {s.high:g}] {s.unit}")
+                return
+        try:
+            step: Step = self.controller.step(sp=sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self.state)
+        except Exception as error:  # the controller in charge goes on, whatever this one does
+            self.miss(named(error))
+            return
+        self.mv, self.state, self.reason = step.mv, step.state, ""
+        self.good += 1
+
+    def miss(self, reason: str) -> None:
+        """A scan without a sample: no past any more."""
+        self.mv, self.state, self.good, self.reason = None, self.controller.cold_state(), 0, reason
+
+    @property
+    def ready(self) -> bool:
+        """Whether it may take over."""
+        return self.good >= self.trial
+
+
+# ----------------------------------------------------------------------------------- the controller that has the plant
+Guards: TypeAlias = Sequence[Guard] | Callable[[Manifest], Sequence[Guard]]
+
+
+class InCharge:
+    """The controller in charge with the state of its law, its guards and the samples that they look back to.
+
+    ``guards`` are a host's own, or what makes them for a controller's manifest: they are then made anew for each
+    controller that takes over.
+    """
+
+    def __init__(self, controller: Controller, guards: Guards) -> None:
+        self.controller = controller
+        self.replaced: Controller | None = None  # the one that was in charge before the present one
+        self.successor: Successor | None = None  # tried beside the controller
+        self._made = guards if callable(guards) else None
+        self.guards: tuple[Guard, ...] = tuple(guards(controller.manifest) if callable(guards) else guards)
+        self._state = controller.cold_state()
+        self._past = deque[Sample](maxlen=_longest(self.guards))
+        self._before: tuple[Sample, ...] = ()  # the past of the present sample, for the successor
+
+    def refusal(self, sample: Sample) -> str | None:
+        """Why not to act on a sample; None where nothing speaks against it."""
+        if not isinstance(sample, Sample):
+            return f"the sample is of the type {type(sample).__name__}; it must be a Sample"
+        if sample.fault:
+            return sample.fault if isinstance(sample.fault, str) else str(sample.fault)
+        return refused(self.guards, sample, self._past)
+
+    def step(self, sample: Sample, sp: Array, applied: Array) -> Step:
+        """One step of the law. It raises what the law raises; ``forget`` then, as the state is of no use any more."""
+        self._before = tuple(self._past) if self.successor is not None else ()
+        step = self.controller.step(sp=sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
+        if self._past.maxlen:
+            self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
+        self._state = step.state
+        return step
+
+    def beside(self, sample: Sample, sp: Array, applied: Array) -> Array | None:
+        """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
+        new = self.successor
+        if new is None:
+            return None
+        new.step(sample, sp, applied, self._before)
+        if new.ready:
+            self.replaced, self.successor = self.controller, None
+            self.controller, self._state = new.controller, new.state
+            if self._made is not None:
+                self.guards = tuple(new.guards)
+                self._past = deque(self._past, maxlen=_longest(self.guards))
+        return new.mv
+
+    def swap(self, controller: Controller, trial: int, loop: Manifest) -> None:
+        """Try ``controller``, in a loop that reads the signals of ``loop``; see ``ControlLoop.swap``."""
+        if trial < 1:
+            raise LoopError(f"trial is {trial}; a controller is tried for at least one scan")
+        new = fitted(controller, loop)
+        self.successor = Successor(new, trial, () if self._made is None else tuple(self._made(new.manifest)))
+
+    def forget(self, reason: str) -> None:
+        """No past any more."""
+        self._past.clear()
+        self.begin_cold(reason)
+
+    def begin_cold(self, reason: str) -> None:
+        """The laws know nothing of what was."""
+        self._state = self.controller.cold_state()
+        if self.successor is not None:
+            self.successor.miss(reason)
+
+
+def _longest(guards: Sequence[Guard]) -> int:
+    """How many past samples the guards need."""
+    return max((g.memory for g in guards), default=0)

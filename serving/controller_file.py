@@ -1,0 +1,94 @@
+"""Bytes of a controller file: the digest at its end, and the JSON file beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from loopwright.serving.errors import ArtifactError
+from loopwright.serving.graph import audit
+from loopwright.serving.manifest import MANIFEST_KEY, MAX_CHARACTERS, Manifest, strictly
+
+# -------------------------------------------------------------- a last metadata entry that covers every byte before it
+DIGEST_KEY = "loopwright.sha256"
+# ModelProto.metadata_props (field 14) holding StringStringEntryProto{key = 1, value = 2}
+_ENTRY = b"\x0a" + bytes([len(DIGEST_KEY)]) + DIGEST_KEY.encode() + b"\x12\x40"
+_HEAD = b"\x72" + bytes([len(_ENTRY) + 64]) + _ENTRY
+TRAILER_BYTES = len(_HEAD) + 64
+
+
+def file_digest(data: bytes) -> str:
+    """Hexadecimal SHA-256, as ``sha256sum`` prints it."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def seal(model: bytes) -> bytes:
+    """The model with its digest appended."""
+    return model + _HEAD + file_digest(model).encode()
+
+
+def unseal(data: bytes) -> bytes:
+    """The model without its digest; ArtifactError if the digest is missing or does not match."""
+    body, trailer = data[:-TRAILER_BYTES], data[-TRAILER_BYTES:]
+    if not body or not trailer.startswith(_HEAD):
+        raise ArtifactError(
+            "the file does not end with a Loopwright digest: it is truncated, changed, or not a controller; "
+            "fetch it again or export the controller again"
+        )
+    if trailer[len(_HEAD) :] != file_digest(body).encode():
+        raise ArtifactError(
+            "the file was changed after export (its digest does not match): "
+            "fetch it again or export the controller again"
+        )
+    return body
+
+
+# ---------------------------------------------------------------- the manifest for hosts that cannot read the metadata
+INDENTED = 16  # times as long at most as the manifest: the deepest entries have a line and 42 blanks of their own
+
+
+def sidecar(manifest: Manifest, sha256: str) -> str:
+    """The JSON file's text: the manifest, and the SHA-256 of the controller's file."""
+    return json.dumps({**json.loads(manifest.to_json()), "sha256": sha256}, indent=2) + "\n"
+
+
+def manifest_in(data: bytes) -> Manifest:
+    """The manifest inside a controller's file. ArtifactError where it is none, or was changed after its export."""
+    unseal(data)
+    return Manifest.from_json(audit.audit(data).metadata.get(MANIFEST_KEY, ""))
+
+
+def require_sidecar(path: Path) -> None:
+    """ArtifactError where the JSON file beside a controller says other things than the controller's own manifest.
+
+    A host that believes the JSON file would command other ranges than those that were validated.
+    """
+    data, beside = path.read_bytes(), path.with_suffix(".json")
+    manifest = manifest_in(data)
+    different = difference(beside.read_bytes(), manifest, file_digest(data))
+    if different:
+        raise ArtifactError(
+            f"{beside.name} is not the manifest of {path.name}: {different} differs; get both from one place"
+        )
+
+
+def difference(text: bytes, manifest: Manifest, sha256: str) -> str:
+    """Where a JSON file differs from the one of a controller, as ``mv.0.high``; empty: it repeats the manifest."""
+    try:
+        found = strictly(text.decode(), INDENTED * MAX_CHARACTERS)
+    except (UnicodeDecodeError, ArtifactError):
+        return "what should be JSON"
+    return _differs(found, json.loads(sidecar(manifest, sha256)), "")
+
+
+def _differs(found: Any, wanted: Any, where: str) -> str:
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        keys = [*wanted, *(key for key in found if key not in wanted)]
+        pairs = [(key, found.get(key, ...), wanted.get(key, ...)) for key in keys]
+    elif isinstance(found, list) and isinstance(wanted, list) and len(found) == len(wanted):
+        pairs = [(str(i), f, w) for i, (f, w) in enumerate(zip(found, wanted, strict=True))]
+    else:
+        return "" if found == wanted and isinstance(found, bool) == isinstance(wanted, bool) else where or "the whole"
+    return next(filter(None, (_differs(f, w, f"{where}.{key}".lstrip(".")) for key, f, w in pairs)), "")

@@ -1,0 +1,166 @@
+"""The modes of a loop, how a fault changes them, the action where a fault lasts, and the result of a scan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from math import inf, isfinite, isnan
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopwright.serving.errors import LoopError
+from loopwright.serving.manifest import Signal
+from loopwright.serving.ranges import within
+
+# ------------------------------------------------------------------------------------------------- where a fault lasts
+Array: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Fallback:
+    """HOLD keeps the last MV; after ``after_s`` [s] of a fault in a row the loop does more than that.
+
+    With ``mv`` (n_mv,) each MV moves there, by at most ``rate`` (n_mv,) [mv units/s] and its ``max_move``. With
+    ``hand_back`` the command asks to hand the plant to its own controller; once that is done the loop writes no more
+    (SHADOW).
+
+    Raises LoopError for times or rates that are not above zero, and where both ways or none is asked for.
+    """
+
+    after_s: float
+    mv: tuple[float, ...] | None = None
+    rate: tuple[float, ...] | None = None
+    hand_back: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.after_s < inf:
+            raise LoopError(f"after_s is {self.after_s}; it must be a finite number of seconds, 0 or more")
+        if self.hand_back == (self.mv is not None):
+            raise LoopError("a fallback either goes to a safe MV or hands back")
+        if (self.mv is None) != (self.rate is None):
+            raise LoopError("a safe MV needs the rate at which the loop goes there, one a manipulated variable")
+        for name, values in (("mv", self.mv), ("rate", self.rate)):
+            if values is not None and not all(map(isfinite, values)):
+                raise LoopError(f"{name} is {values}; it needs finite numbers")
+        if self.rate is not None and not all(r > 0 for r in self.rate):
+            raise LoopError(f"rate is {self.rate}; each must be above zero")
+
+    def check(self, signals: Sequence[Signal]) -> None:
+        """LoopError where the safe MV is none of these MVs, or the rates are not as many."""
+        if self.mv is None or self.rate is None:
+            return
+        within(self.mv, signals, "safe MV")
+        if len(self.rate) != len(signals):
+            raise LoopError(f"the fallback has {len(self.rate)} rates; it needs {len(signals)}, one an MV")
+
+    def toward(self, mv: Array, signals: Sequence[Signal], period_s: float) -> Array:
+        """The MV (n_mv,) one period nearer to the safe one; a discrete MV goes there at once."""
+        if self.mv is None or self.rate is None:
+            return mv
+        most = np.array(
+            [
+                inf if s.values is not None else min(r * period_s, s.max_move or inf)
+                for s, r in zip(signals, self.rate, strict=True)
+            ]
+        )
+        move = np.array(self.mv) - mv
+        near = np.abs(move) <= most
+        return np.where(near, self.mv, np.clip(mv + np.clip(move, -most, most), *_ends(signals)))
+
+
+def _ends(signals: Sequence[Signal]) -> tuple[Array, Array]:
+    return np.array([s.low for s in signals]), np.array([s.high for s in signals])
+
+
+# --------------------------------------------------------------------------------------------------------------- modes
+class Mode(StrEnum):
+    """The source of the MV: MANUAL the operator, AUTO the law, HOLD the last applied MV, SHADOW the plant's own side.
+
+    In SHADOW nothing is written.
+    """
+
+    MANUAL = "MANUAL"
+    AUTO = "AUTO"
+    HOLD = "HOLD"
+    SHADOW = "SHADOW"
+
+
+def mode_of(mode: Mode | str) -> Mode:
+    """``mode``, also given as its name; LoopError for anything else, as a loop in no mode would write the old MV."""
+    try:
+        return Mode(mode)
+    except ValueError:
+        raise LoopError(f"the mode is {mode!r}; it must be one of {', '.join(Mode)}") from None
+
+
+class LoopMode:
+    """The mode of a loop now, and the fault that changed it to HOLD.
+
+    Somebody sets the mode, or a scan in AUTO without an MV of the law is a fault: HOLD. So many good samples change it
+    back. A fault that lasts is for the fallback.
+    """
+
+    def __init__(self, mode: Mode) -> None:
+        self.set(mode)
+
+    def set(self, mode: Mode) -> None:
+        """Somebody sets the mode: a fault is over."""
+        self.now, self.fault = mode, ""  # empty without a fault
+        self._good = 0  # good samples in a row since it began
+        self._held = 0  # scans since it began
+
+    def lose(self, reason: str) -> None:
+        """A scan gave no MV of the law: in AUTO a fault."""
+        self._good = 0
+        if self.now is Mode.AUTO or self.fault:
+            self.now, self.fault = Mode.HOLD, reason
+
+    def recovers(self, after: int | None) -> bool:
+        """A good sample during a fault: whether it is the last of the ``after`` that lead back to AUTO; None: none."""
+        self._good += 1
+        return after is not None and self._good >= after
+
+    def hold(self) -> None:
+        """Count a scan of a fault."""
+        self._held += bool(self.fault)
+
+    def overdue(self, fallback: Fallback | None, period_s: float) -> bool:
+        """Whether a fault has lasted so long that ``fallback`` is due."""
+        if not self.fault or fallback is None:
+            return False
+        return (self._held - 1) * period_s >= fallback.after_s
+
+    def handing_back(self, fallback: Fallback | None, period_s: float) -> bool:
+        """Whether the plant is to be given to its own controller."""
+        return fallback is not None and fallback.hand_back and self.overdue(fallback, period_s)
+
+
+# ------------------------------------------------------------------------------------------------ the result of a scan
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """The result of one scan. ``reason`` names a fault; it is empty without one.
+
+    A host that runs the loop itself writes ``mv`` where ``writes`` is true: not in SHADOW, and not while ``mv`` is NaN
+    because no sample has told yet where the MV stands. Where ``hand_back`` is true, it gives the plant back to the
+    plant's own controller, and then sets the mode to SHADOW.
+    """
+
+    scan: int
+    mode: Mode
+    sp: Array  # shape: (n_sp,)
+    mv: Array  # shape: (n_mv,), to be written; NaN while it is not known where the MV stands
+    law_mv: Array | None  # the law's MV, also in MANUAL; None if the law was not stepped or its step failed
+    info: Array | None  # shape: (n_info,)
+    reason: str = ""
+    successor_mv: Array | None = None  # shape: (n_mv,), of a controller that is tried beside the law; else None
+    hand_back: bool = False
+
+    @property
+    def writes(self) -> bool:
+        """Whether ``mv`` is to be written."""
+        return self.mode is not Mode.SHADOW and not isnan(self.mv[0])  # all of it is known, or none

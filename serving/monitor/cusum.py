@@ -1,0 +1,217 @@
+"""Whether figures have moved for good from what they were while they were learnt."""
+
+from __future__ import annotations
+
+from math import log, sqrt
+from statistics import NormalDist
+from typing import ClassVar, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopwright.serving.monitor.learning import ANY, COUNT, POSITIVE, SIZE, TIME_S, Kept, Remembers
+
+Array: TypeAlias = NDArray[np.float64]
+
+SLACK = 1.0  # scatters by which a figure may lie off without a trace
+DOUBT = 0.05  # that what was learnt of any one of a chart's figures flatters
+OVERSHOOT = 1.166  # of a sum of normal figures over its limit, in scatters [Siegmund]
+LEAST_LIMIT = 4.0
+LEAST_ROOT = 0.2  # of chi2 / nu: the approximation holds no further
+FEWEST = 3.0  # degrees of freedom that a scatter is believed to have at least
+WORTH, DOUBLINGS = 12.0, 2  # independent figures that learning needs; how often it may last twice as long for them
+
+
+class Chart(Remembers):
+    """Page's cumulative sums, upwards and downwards, for each of n figures x(j).
+
+        up(j) = max(0, up(j-1) + z(j) - k),    down(j) = max(0, down(j-1) - z(j) - k),    z = (x - mean) / scatter
+
+    ``found`` once a sum exceeds the limit, until it has fallen below half of it. A z counts at most half a limit, so
+    that it takes three figures at least; a sum never exceeds twice the limit, so a shift that is over is forgotten. A
+    shift that came back by itself was none of the plant's: the limit becomes ``RISE`` times as large, ``RISES`` times
+    at most.
+
+    The first ``learn`` figures give mean, scatter s and correlation f = 1 + 2 sum rho: they are worth learn / f
+    independent ones. Below WORTH of those, pairs are averaged, and learning lasts twice as long. Scatter and mean
+    count with the unfavourable ends of their intervals, a higher scatter and a k above SLACK, at a level of DOUBT / n:
+    of many figures one or two were calmer by chance than they will be. Where the scatter
+    s is below ``least``, ``least`` takes its place and f (s / least)^2 that of f, but at least 1: z scatters by less
+    then, and hangs together all the same. The limit is that of a sum of long-run variance f (a Brownian motion) whose
+    mean time to a false alarm is A figures:
+
+        limit = f / (2 k) ln(1 + 2 k^2 A / f) - 1.17,    A = figures a week / false alarms a week
+
+    Sources: Page, "Continuous inspection schemes", Biometrika 41 (1954) 100; Siegmund, "Sequential Analysis" (1985),
+    eq. 2.56.
+
+    Parameters
+    ----------
+    n
+        Figures.
+    learn
+        How many of each are learnt, after ``pool`` are averaged.
+    weekly
+        Figures a week, before pooling.
+    rate
+        False alarms a week that are allowed to one of the n.
+    least
+        Scatter below which a shift is not worth a word.
+    both
+        Whether a shift downwards matters, too.
+    pool
+        Figures that are averaged to one.
+    """
+
+    RISE, RISES = 1.5, 4
+    MOST = 0.5  # of the limit that one figure counts
+    KEPT: ClassVar[Kept] = {
+        "pool": (1, 10**9),
+        "doublings": (0, DOUBLINGS),
+        "weekly": POSITIVE,
+        "sums": ANY,
+        "pooled": COUNT,
+        "figures": ANY,
+        "count": COUNT,
+        "mean": ANY,
+        "scatter": POSITIVE,
+        "slack": SIZE,
+        "limit": POSITIVE,
+        "up": SIZE,
+        "down": SIZE,
+        "last": ANY,
+        "recent": ANY,
+        "off": ANY,
+        "offs": SIZE,
+        "found": (0, 1),
+        "rises": (0, RISES),
+        "began_s": TIME_S,
+        "since_s": TIME_S,
+    }
+
+    def __init__(
+        self, n: int, learn: int, *, weekly: float, rate: float, least: float = 0.0, both: bool = True, pool: int = 1
+    ) -> None:
+        self.n, self.learn, self.both, self.pool, self.least = n, learn, both, pool, least
+        self.rate, self.weekly, self.doublings = rate, weekly, 0
+        self.sums, self.pooled = np.zeros(n), 0
+        self.figures, self.count = np.zeros((learn, n)), 0
+        self.mean, self.scatter, self.slack, self.limit = np.zeros(n), np.ones(n), np.ones(n), np.full(n, LEAST_LIMIT)
+        self.up, self.down, self.last, self.recent = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+        # Sum and number of the figures since the present sums began, upwards and downwards.
+        self.off, self.offs = np.zeros((2, n)), np.zeros((2, n))
+        self.found, self.rises = np.zeros(n), np.zeros(n)  # found: 1 or 0
+        self.began_s, self.since_s = np.zeros((2, n)), np.zeros(n)  # the present sums, the shift that was found
+
+    @property
+    def learnt(self) -> bool:
+        """Whether it has seen enough."""
+        return self.count >= self.learn
+
+    @property
+    def done(self) -> float:
+        """Share of the learning time that is over."""
+        return min((self.count + self.pooled / self.pool) / self.learn, 1.0)
+
+    def shift(self, i: int) -> float:
+        """By how much a figure lies off: since the shift began where one was found, else over the last ten or so."""
+        if self.found[i]:
+            return float(self._since()[i])
+        return float(self.recent[i] - self.mean[i])
+
+    def shares(self) -> Array:
+        """The shifts of those that were found, in scatters (n,); 0 of the others."""
+        return np.asarray(self.found * self._since() / self.scatter)
+
+    def _since(self) -> Array:
+        """Means of what figures lie off by since the larger sum began, (n,)."""
+        means = self.off / np.maximum(self.offs, 1)
+        return np.asarray(np.where(self.up >= self.down, means[0], means[1]))
+
+    def add(self, x: Array, time_s: float) -> None:
+        """One of each figure (n,)."""
+        self.sums = self.sums + x
+        self.pooled += 1
+        if self.pooled < self.pool:
+            return
+        x = self.sums / self.pooled
+        self.sums, self.pooled = np.zeros(self.n), 0
+        self.last = x
+        self.count += 1
+        if self.count <= self.learn:
+            self.figures[self.count - 1] = x
+            if self.count == self.learn:
+                self._reckon()
+            return
+        self._judge(x, time_s)
+
+    def _reckon(self) -> None:
+        self.mean, s = self.figures.mean(axis=0), self.figures.std(axis=0, ddof=1)
+        f = correlation(self.figures)
+        z = NormalDist().inv_cdf(1 - DOUBT / max(self.n, 1))
+        wide = s * np.array([upper_scatter(self.learn / one - 1, z) for one in f.tolist()])
+        self.scatter = np.maximum(wide, self.least) + 1e-12
+        f = np.maximum(f * (wide / self.scatter) ** 2, 1.0)  # long-run variance of (x - mean) / scatter
+        if self.n and self.learn / f.mean() < WORTH and self.doublings < DOUBLINGS:
+            half = self.learn // 2
+            self.figures[:half] = self.figures[: 2 * half].reshape(half, 2, self.n).mean(axis=1)
+            self.count, self.pool, self.doublings = half, 2 * self.pool, self.doublings + 1
+            return
+        run_length = self.weekly / self.pool / self.rate * (2 if self.both else 1)
+        self.slack = SLACK + z * np.sqrt(f / self.learn)
+        self.limit = np.array([run_limit(SLACK, run_length, one) for one in f.tolist()])
+        self.recent = self.mean.copy()
+        self.figures = np.zeros((self.learn, self.n))
+
+    def _judge(self, x: Array, time_s: float) -> None:
+        self.recent = self.recent + (x - self.recent) / min(self.count - self.learn, 10)
+        most = self.MOST * self.limit
+        z = np.clip((x - self.mean) / self.scatter, -most, most)
+        goes_on = np.array([self.up, self.down]) > 0
+        self.began_s = np.where(goes_on, self.began_s, time_s)
+        self.off = goes_on * self.off + x - self.mean
+        self.offs = goes_on * self.offs + 1
+        self.up = np.clip(self.up + z - self.slack, 0.0, 2 * self.limit)
+        if self.both:
+            self.down = np.clip(self.down - z - self.slack, 0.0, 2 * self.limit)
+        largest = np.maximum(self.up, self.down)
+        begins = (largest > self.limit) & (self.found == 0)
+        over = (largest < self.limit / 2) & (self.found > 0)
+        began_s = np.where(self.up >= self.down, self.began_s[0], self.began_s[1])
+        self.since_s = np.where(begins, began_s, self.since_s)
+        self.found = np.where(begins, 1.0, np.where(over, 0.0, self.found))
+        rise = over & (self.rises < self.RISES)
+        self.limit = np.where(rise, self.RISE * self.limit, self.limit)
+        self.rises = self.rises + rise
+
+
+def run_limit(slack: float, figures: float, f: float = 1.0) -> float:
+    """The limit of a one-sided sum whose mean time to a false alarm is ``figures``; see ``Chart``."""
+    limit = f / (2 * slack) * log(1 + 2 * slack**2 * figures / f) - OVERSHOOT
+    return max(limit, LEAST_LIMIT)
+
+
+def upper_scatter(freedom: float, z: float) -> float:
+    """Factor on a scatter of so many degrees of freedom for the upper end of its interval.
+
+    sqrt(nu / chi2(nu)), by Wilson's and Hilferty's chi2 = nu (1 - 2 / (9 nu) - z sqrt(2 / (9 nu)))^3, with the normal
+    quantile z of the level.
+    """
+    nu = max(freedom, FEWEST)
+    return 1 / sqrt(max(1 - 2 / (9 * nu) - z * sqrt(2 / (9 * nu)), LEAST_ROOT) ** 3)
+
+
+def correlation(x: Array) -> Array:
+    """1 + 2 sum rho of each column of x (n, m), by the means of ever longer pieces: the largest that is found.
+
+    Pieces of b figures have the variance f s^2 / b, where b is longer than the correlation. At least eight pieces.
+    """
+    n = len(x)
+    off = x - x.mean(axis=0)
+    variance = np.maximum((off**2).mean(axis=0), 1e-300)
+    found = np.ones(x.shape[1])
+    for b in sorted({int(1.5**i) for i in range(2, 30) if 1.5**i < n // 8} | {n // 8}):
+        means = off[: n // b * b].reshape(n // b, b, -1).mean(axis=1)
+        found = np.maximum(found, b * (means**2).mean(axis=0) / variance * (n // b) / (n // b - 1))
+    # The mean of n figures is theirs: what lies off it scatters less than the figures, by f / n.
+    return np.minimum(found / np.maximum(1 - found / n, 0.5), n / (FEWEST + 1))
