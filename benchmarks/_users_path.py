@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from _free_run import Part, Predictor
 
-from loopwright.pipeline.models.base import load_model
+from loopwright.pipeline.models import load_model
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified import Identified
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import requests
 from processes import within
 
+from loopwright.pipeline.engine.cluster import STAGES
 from loopwright.pipeline.engine.parent_death import end_with_parent
-from loopwright.pipeline.engine.start import STAGES
 
 ROOT = Path(__file__).parents[1]
 BUCKETS = ("mlflow", "dvc")

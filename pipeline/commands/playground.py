@@ -15,8 +15,7 @@ from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.export.plant_graphs import plant_graphs
 from loopwright.pipeline.playground.about import about, validation_of
-from loopwright.pipeline.playground.server import HOST, file_server
-from loopwright.pipeline.playground.site import Playground, write_folder, write_one_file
+from loopwright.pipeline.playground.site import HOST, Playground, file_server, write_folder, write_one_file
 from loopwright.pipeline.playground.web_runtime import web_runtime
 from loopwright.serving.controller import Controller
 

@@ -16,12 +16,15 @@ from typing import TYPE_CHECKING
 from loopwright.pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Worker
 
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
 WORKERS = "LOOPWRIGHT_WORKERS"  # how many a cluster of this machine has where nobody says it; unset: one a core
 CONNECT_S = 20.0
 WORKERS_S = 120.0  # for the first worker, whose libraries take some seconds
+# Set for the workers of a cluster of this machine: kinds of stages, with commas, that it is for. Unset: any may come.
+STAGES = "LOOPWRIGHT_STAGES"
+PROFILING = ("profile", "profile-cycle")  # callbacks of a worker
 PRELOAD = ["loopwright.pipeline.engine.preload"]
 # What workers have in their environment before they start. They keep memory that is freed: Dask has them give it back
 # to the system at once, and the pages that it then has to clear anew took up to a third of a training's time.
@@ -184,3 +187,15 @@ def _can_draw() -> bool:
     except ImportError:
         return False
     return True
+
+
+def unwatched(worker: Worker) -> None:
+    """End Dask's sampling profiler of a worker; of one that was started without this module, a task does it.
+
+    The profiler looks into the frames of running tasks. torch.export then now and then loses track of a tensor and
+    fails: 4 of 40 first exports of a process did, and none of 120 without it.
+    """
+    for name in PROFILING:
+        callback = worker.periodic_callbacks.pop(name, None)
+        if callback is not None:
+            worker.loop.add_callback(callback.stop)

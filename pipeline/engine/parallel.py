@@ -16,7 +16,7 @@ import cloudpickle
 from loopwright.pipeline.engine.cluster import address, connected
 from loopwright.pipeline.engine.fingerprint import fingerprint
 from loopwright.pipeline.engine.folder import Changes, Files, apply
-from loopwright.pipeline.engine.pieces import Task, alone, current_task, on_worker
+from loopwright.pipeline.engine.pieces import Task, alone, current_task, lost, on_worker
 from loopwright.pipeline.engine.progress import piece, progress_bar, within
 from loopwright.pipeline.errors import PipelineError
 
@@ -107,22 +107,6 @@ def as_done(
         result, changes = answers[i]
         apply(changes)
         yield i, result
-
-
-def lost(error: Exception, what: str) -> PipelineError:
-    """The line for work that the cluster could not do."""
-    from distributed import KilledWorker
-
-    if isinstance(error, KilledWorker):
-        # Dask counts the deaths of a worker for all that waits there, so no single piece can be named.
-        return PipelineError(
-            "workers died one after the other (often the memory was not enough); start fewer, and run it again"
-        )
-    if "scheduler-connection-lost" in str(error):
-        return PipelineError(
-            f"the connection to the scheduler at {address()} was lost; start it again, and run this again"
-        )
-    return PipelineError(f"{what}: the cluster gave it up ({' '.join(str(error).split())}); run it again")
 
 
 def _answers(

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
+from loopwright.pipeline.engine.cluster import address, unwatched
 from loopwright.pipeline.engine.fingerprint import difference, fingerprint
 from loopwright.pipeline.engine.folder import Files, Folder
-from loopwright.pipeline.engine.preload import unwatched
 from loopwright.pipeline.engine.progress import lines_anew
 from loopwright.pipeline.errors import PipelineError
 
@@ -178,3 +178,19 @@ def _as_bytes(error: Exception) -> bytes:
     except Exception:  # not every error survives the way
         return pickle.dumps((PipelineError(f"{type(error).__name__}: {error}"), None, {}))
     return content
+
+
+def lost(error: Exception, what: str) -> PipelineError:
+    """The line for work that the cluster could not do."""
+    from distributed import KilledWorker
+
+    if isinstance(error, KilledWorker):
+        # Dask counts the deaths of a worker for all that waits there, so no single piece can be named.
+        return PipelineError(
+            "workers died one after the other (often the memory was not enough); start fewer, and run it again"
+        )
+    if "scheduler-connection-lost" in str(error):
+        return PipelineError(
+            f"the connection to the scheduler at {address()} was lost; start it again, and run this again"
+        )
+    return PipelineError(f"{what}: the cluster gave it up ({' '.join(str(error).split())}); run it again")

@@ -18,8 +18,8 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from loopwright.pipeline.engine.capture_output import listen
+from loopwright.pipeline.engine.cluster import STAGES, unwatched
 from loopwright.pipeline.engine.fingerprint import fingerprint
-from loopwright.pipeline.engine.start import STAGES
 
 if TYPE_CHECKING:
     from distributed import Worker
@@ -42,7 +42,6 @@ OF_KIND = {
     **dict.fromkeys(("code", "screen", "report", "overview", "publish"), ()),
 }
 IDLE_S = 0.05  # until a worker that has a task looks again whether it may go on importing
-PROFILING = ("profile", "profile-cycle")
 # The ends of the pipeline that no worker runs.
 APART = tuple(
     f"loopwright.pipeline.{name}"
@@ -79,18 +78,6 @@ def dask_setup(worker: Worker) -> None:
             gc.freeze()  # nor need tasks look through it
 
     worker.loop.add_callback(go_on)
-
-
-def unwatched(worker: Worker) -> None:
-    """End Dask's sampling profiler of a worker; of one that was started without this module, a task does it.
-
-    The profiler looks into the frames of running tasks. torch.export then now and then loses track of a tensor and
-    fails: 4 of 40 first exports of a process did, and none of 120 without it.
-    """
-    for name in PROFILING:
-        callback = worker.periodic_callbacks.pop(name, None)
-        if callback is not None:
-            worker.loop.add_callback(callback.stop)
 
 
 def load() -> None:

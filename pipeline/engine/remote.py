@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopwright.pipeline.engine.capture_output import BARS
-from loopwright.pipeline.engine.cluster import connected
+from loopwright.pipeline.engine.cluster import connected, unwatched
 from loopwright.pipeline.engine.fingerprint import difference, fingerprint
 from loopwright.pipeline.engine.folder import Folder, apply, read_files
 from loopwright.pipeline.engine.git_commit import commit, told
@@ -46,7 +46,7 @@ def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:
         future.cancel()
         raise
     except Exception as error:
-        from loopwright.pipeline.engine.parallel import lost  # with what the pieces need, which a client does not
+        from loopwright.pipeline.engine.pieces import lost  # with what the pieces need, which a client does not
 
         print(f"{' '.join(arguments)}: {lost(error, 'the stage')}", file=sys.stderr)
         return FAILED
@@ -66,7 +66,6 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     from loopwright.pipeline.engine.capture_output import spoken_to
     from loopwright.pipeline.engine.command import run_stage
     from loopwright.pipeline.engine.pieces import Task, doing, mixture, still_wanted
-    from loopwright.pipeline.engine.preload import unwatched
     from loopwright.pipeline.engine.progress import lines_anew
 
     worker, files = get_worker(), pickle.loads(read)

@@ -24,8 +24,6 @@ from pathlib import Path
 # Set for the commands under loopwright.pipeline.engine.with_cluster: the door of a run, which is open as long as the
 # run goes on.
 DOOR = "LOOPWRIGHT_RUN"
-# Set for the workers of a cluster of this machine: kinds of stages, with commas, that it is for. Unset: any may come.
-STAGES = "LOOPWRIGHT_STAGES"
 # New objects before garbage is looked for. A stage imports for a second and ends soon: at Python's 700 a sixth of its
 # time goes into looking through libraries that stay.
 NEW_OBJECTS = 200_000
@@ -86,7 +84,7 @@ def run(arguments: list[str]) -> int | str | None:
     files = on_cluster(arguments[0], arguments[1]) if len(arguments) == 2 else None
     if files is None:
         return run_here(arguments)
-    from loopwright.pipeline.engine.cluster import address, local_cluster
+    from loopwright.pipeline.engine.cluster import STAGES, address, local_cluster
     from loopwright.pipeline.engine.remote import FAILED, run_on
     from loopwright.pipeline.errors import PipelineError
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +13,203 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx.reference import ReferenceEvaluator
 
 from loopwright.pipeline.errors import ExportError
-from loopwright.pipeline.export.casadi_graph import OPSET, casadi_graph
 from loopwright.pipeline.plants.equations import EquationPlant, rk4_step
 from loopwright.pipeline.plants.simulator import Array
+from loopwright.serving.graph.audit import MAX_IR
 
+OPSET = 18
+RUNS = "n"  # the first dimension of every input and output: runs side by side
+
+# Operations of CasADi that are one operator of ONNX; onnxruntime has each of them in float64.
+ONE_OPERATOR = {
+    ca.OP_ADD: "Add",
+    ca.OP_SUB: "Sub",
+    ca.OP_MUL: "Mul",
+    ca.OP_DIV: "Div",
+    ca.OP_NEG: "Neg",
+    ca.OP_EXP: "Exp",
+    ca.OP_LOG: "Log",
+    ca.OP_POW: "Pow",
+    ca.OP_CONSTPOW: "Pow",
+    ca.OP_SQRT: "Sqrt",
+    ca.OP_SIN: "Sin",
+    ca.OP_COS: "Cos",
+    ca.OP_TANH: "Tanh",
+    ca.OP_FLOOR: "Floor",
+    ca.OP_CEIL: "Ceil",
+    ca.OP_FABS: "Abs",
+    ca.OP_SIGN: "Sign",
+    ca.OP_FMIN: "Min",
+    ca.OP_FMAX: "Max",
+}
+COMPARISONS = {ca.OP_LT: "Less", ca.OP_LE: "LessOrEqual", ca.OP_EQ: "Equal"}
+LOGIC = {ca.OP_AND: "And", ca.OP_OR: "Or"}
+NAMES = {getattr(ca, name): name.removeprefix("OP_").lower() for name in dir(ca) if name.startswith("OP_")}
+
+
+def casadi_graph(functions: Sequence[tuple[ca.Function, Sequence[str], Sequence[str]]], name: str) -> onnx.ModelProto:
+    """One graph of some functions of column vectors, each with the names of its arguments and of its results.
+
+    Functions that name the same argument share it. An argument or a result ``v`` (m,) of a function is the graph's
+    input or output (n, m): row i belongs to run i. Arguments of size zero are left out. Every operation
+    is carried out once, in CasADi's order and in float64, so that the graph gives what the functions give but for the
+    rounding of exp and its like.
+
+    Raises ExportError for an operation that ONNX lacks in float64, for a matrix, and for a sparse vector.
+    """
+    graph = _Graph(name)
+    for function, arguments, results in functions:
+        graph.add(function if function.is_a("SXFunction") else function.expand(), arguments, results)
+    return graph.model()
+
+
+class _Graph:
+    """The nodes so far. A value is a column (n, 1) or a constant (); one with the same operands is made once."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.nodes: list[onnx.NodeProto] = []
+        self.inputs: dict[str, list[str]] = {}  # name -> its columns
+        self.outputs: dict[str, int] = {}  # name -> its size
+        self.constants: dict[str, str] = {}  # bits -> name
+        self.made: dict[tuple[str, ...], str] = {}
+        self.truths: dict[str, str] = {}  # a column of 0 and 1 -> the same as booleans
+        self.count = 0
+        self.tensors: list[onnx.TensorProto] = []
+
+    def add(self, function: ca.Function, arguments: Sequence[str], results: Sequence[str]) -> None:
+        """Add the function's operations."""
+        columns = [self._input(function, i, name) for i, name in enumerate(arguments)]
+        found: list[dict[int, str]] = [{} for _ in results]
+        work: dict[int, str] = {}
+        for i in range(function.n_instructions()):
+            operation = function.instruction_id(i)
+            given, gives = function.instruction_input(i), function.instruction_output(i)
+            if operation == ca.OP_INPUT:
+                work[gives[0]] = columns[given[0]][given[1]]
+            elif operation == ca.OP_OUTPUT:
+                found[gives[0]][gives[1]] = work[given[0]]
+            elif operation == ca.OP_CONST:
+                work[gives[0]] = self._constant(function.instruction_constant(i))
+            else:
+                work[gives[0]] = self._operation(function, operation, [work[place] for place in given])
+        for i, name in enumerate(results):
+            self._output(function, i, name, found[i], columns)
+
+    # ------------------------------------------------------------------ ends
+    def _input(self, function: ca.Function, i: int, name: str) -> list[str]:
+        size = _size(function, f"argument {name!r}", function.sparsity_in(i))
+        if name not in self.inputs:
+            self.inputs[name] = [self._fresh() for _ in range(size)]
+            if size:
+                self.nodes.append(helper.make_node("Split", [name], self.inputs[name], axis=1, num_outputs=size))
+        if len(self.inputs[name]) != size:
+            raise ExportError(
+                f"argument {name!r} has {size} entries in function {function.name()!r} and "
+                f"{len(self.inputs[name])} in another; arguments of one name must be of one size"
+            )
+        return self.inputs[name]
+
+    def _output(
+        self, function: ca.Function, i: int, name: str, entries: dict[int, str], columns: list[list[str]]
+    ) -> None:
+        size = _size(function, f"result {name!r}", function.sparsity_out(i))
+        # A constant belongs to no run; it gets the shape of an argument's column.
+        like = next((column for given in columns for column in given), None)
+        parts = [self._column(entries[k], like, function) for k in range(size)]
+        self.nodes.append(helper.make_node("Concat", parts, [name], axis=1))
+        self.outputs[name] = size
+
+    def _column(self, value: str, like: str | None, function: ca.Function) -> str:
+        if value not in self.constants.values():
+            return value
+        if like is None:
+            raise ExportError(f"function {function.name()!r} has no arguments, so its results belong to no run")
+        return self._node("Expand", value, self._node("Shape", like))
+
+    # ------------------------------------------------------------------ operations
+    def _operation(self, function: ca.Function, operation: int, given: list[str]) -> str:
+        if operation in ONE_OPERATOR:
+            return self._node(ONE_OPERATOR[operation], *given)
+        if operation in COMPARISONS:
+            return self._number(self._node(COMPARISONS[operation], *given))
+        if operation in LOGIC:
+            return self._number(self._node(LOGIC[operation], *map(self._truth, given)))
+        composed = self._composed().get(operation)
+        if composed is None:
+            known = sorted(NAMES[o] for o in {*ONE_OPERATOR, *COMPARISONS, *LOGIC, *self._composed()})
+            raise ExportError(
+                f"function {function.name()!r} uses {NAMES.get(operation, operation)}, for which onnxruntime has no "
+                f"operator in float64; write it with {', '.join(known)}"
+            )
+        return composed(*given)
+
+    def _composed(self) -> dict[int, Callable[..., str]]:
+        return {
+            ca.OP_ASSIGN: lambda a: a,
+            ca.OP_SQ: lambda a: self._node("Mul", a, a),
+            ca.OP_TWICE: lambda a: self._node("Add", a, a),
+            ca.OP_INV: lambda a: self._node("Div", self._constant(1.0), a),
+            ca.OP_TAN: lambda a: self._node("Div", self._node("Sin", a), self._node("Cos", a)),
+            ca.OP_NOT: lambda a: self._number(self._node("Not", self._truth(a))),
+            ca.OP_NE: lambda a, b: self._number(self._node("Not", self._node("Equal", a, b))),
+            ca.OP_IF_ELSE_ZERO: lambda a, b: self._node("Where", self._truth(a), b, self._constant(0.0)),
+        }
+
+    def _truth(self, value: str) -> str:
+        """The booleans of a column of numbers: all but 0 are true."""
+        known = self.truths.get(value)
+        return known or self._node("Not", self._node("Equal", value, self._constant(0.0)))
+
+    def _number(self, truth: str) -> str:
+        """0 and 1 for booleans."""
+        number = self._node("Cast", truth, to=TensorProto.DOUBLE)
+        self.truths[number] = truth
+        return number
+
+    def _node(self, operator: str, *given: str, **attributes: Any) -> str:
+        key = (operator, *given)
+        if key not in self.made:
+            self.made[key] = self._fresh()
+            self.nodes.append(helper.make_node(operator, list(given), [self.made[key]], **attributes))
+        return self.made[key]
+
+    def _constant(self, value: float) -> str:
+        bits = float(value).hex()
+        if bits not in self.constants:
+            self.constants[bits] = self._fresh()
+            self.tensors.append(numpy_helper.from_array(np.array(float(value)), self.constants[bits]))
+        return self.constants[bits]
+
+    def _fresh(self) -> str:
+        self.count += 1
+        return f"v{self.count}"
+
+    # ------------------------------------------------------------------ the model
+    def model(self) -> onnx.ModelProto:
+        """The graph as a checked model."""
+
+        def ends(sizes: dict[str, int]) -> list[onnx.ValueInfoProto]:
+            return [helper.make_tensor_value_info(n, TensorProto.DOUBLE, [RUNS, m]) for n, m in sizes.items() if m]
+
+        inputs = ends({name: len(columns) for name, columns in self.inputs.items()})
+        graph = helper.make_graph(self.nodes, self.name, inputs, ends(self.outputs), self.tensors)
+        opset = [helper.make_opsetid("", OPSET)]
+        model = helper.make_model(graph, opset_imports=opset, ir_version=MAX_IR, producer_name="loopwright")
+        onnx.checker.check_model(model, full_check=True)
+        return model
+
+
+def _size(function: ca.Function, what: str, sparsity: ca.Sparsity) -> int:
+    """Number of entries of a dense column; ExportError for anything else."""
+    if not (sparsity.is_dense() and sparsity.size2() == 1) and sparsity.numel():
+        raise ExportError(
+            f"{what} of function {function.name()!r} is {sparsity.dim()}; it must be a dense column (use ca.densify)"
+        )
+    return int(sparsity.numel())
+
+
+# ----------------------------------------------------------------------------------------------- the graphs of a plant
 UNROLLED = 1_500  # operations above which the substeps are a loop: a runtime takes seconds to load thousands of nodes
 TOLERANCE = 1e-9
 MANIPULATED = ("x", "mv", "dv", "p")

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from loopwright.pipeline.models.base import Model, load_model
+import json
+from pathlib import Path
+
+import numpy as np
+
+from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.lagged.arx import ArxPart
@@ -29,3 +35,16 @@ MODELS: dict[str, type[Part]] = {
 }
 
 __all__ = ["MODELS", "Learnt", "Model", "Part", "Source", "load_model"]
+
+
+def load_model(path: Path) -> Model:
+    """The model in ``path``, whatever its kind; raises ModelError for a foreign or damaged file."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            header = json.loads(str(file["__model__"]))
+            arrays = {k: file[k] for k in file.files if k != "__model__"}
+        return MODELS[header["kind"]].model.from_arrays(header["config"], arrays)
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise ModelError(
+            f"{path} is not a model that this pipeline wrote ({error}); run the fit stage again"
+        ) from error

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.files import draft_of
 
 
@@ -66,18 +65,3 @@ def simulate(model: Model, start: Tensor, mv: Tensor) -> Tensor:
     for move in mv.unbind(dim=-2):
         states.append(model(torch.cat([states[-1], move], dim=-1)))
     return torch.stack(states[1:], dim=-2)
-
-
-def load_model(path: Path) -> Model:
-    """The model in ``path``, whatever its kind; raises ModelError for a foreign or damaged file."""
-    from loopwright.pipeline.models import MODELS
-
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(str(file["__model__"]))
-            arrays = {k: file[k] for k in file.files if k != "__model__"}
-        return MODELS[header["kind"]].model.from_arrays(header["config"], arrays)
-    except (OSError, ValueError, KeyError, RuntimeError) as error:
-        raise ModelError(
-            f"{path} is not a model that this pipeline wrote ({error}); run the fit stage again"
-        ) from error

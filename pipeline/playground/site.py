@@ -10,8 +10,10 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import loopwright.pipeline.hosts
 import loopwright.serving.page
@@ -21,6 +23,42 @@ from loopwright.pipeline.files import draft_folder_of, write_bytes, write_text
 from loopwright.pipeline.playground.web_runtime import LICENCE, MODULE, WASM
 from loopwright.serving.controller import Controller
 
+HOST = "127.0.0.1"
+
+
+class _Files(SimpleHTTPRequestHandler):
+    # What the machine's own table says of these differs from system to system; a browser wants exactly these.
+    extensions_map: ClassVar[dict[str, str]] = {  # type: ignore[misc]
+        "": "application/octet-stream",
+        ".html": "text/html; charset=utf-8",
+        ".css": "text/css",
+        ".js": "text/javascript",
+        ".mjs": "text/javascript",
+        ".json": "application/json",
+        ".svg": "image/svg+xml",
+        ".wasm": "application/wasm",
+    }
+
+    def end_headers(self) -> None:
+        """Add that nothing is to be kept: a page that was written again is to be seen."""
+        self.send_header("Cache-Control", "no-cache")
+        super().end_headers()
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Say nothing of each request."""
+
+
+def file_server(folder: Path, port: int) -> ThreadingHTTPServer:
+    """A server of ``folder`` that listens at ``port``, 0 for any free one; PipelineError where it cannot."""
+    try:
+        return ThreadingHTTPServer((HOST, port), partial(_Files, directory=str(folder)))
+    except OSError as error:
+        raise PipelineError(
+            f"nothing can listen at {HOST}:{port}: {error.strerror or error}; give another --port, 0 for a free one"
+        ) from None
+
+
+# -------------------------------------------------------------------------------------------------- the page of a case
 STATIC = Path(__file__).parent / "static"
 # The step and the loop are those of the hosts in Node and the browser.
 LOOP = Path(loopwright.pipeline.hosts.__file__).parent / "javascript" / "controller.mjs"

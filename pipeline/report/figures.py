@@ -23,9 +23,13 @@ from loopwright.pipeline.pictures.loop_pictures import (
     loops_picture,
     overview_picture,
 )
-from loopwright.pipeline.pictures.model_pictures import candidates_picture, one_step_picture, predictions_picture
+from loopwright.pipeline.pictures.model_pictures import (
+    candidates_picture,
+    one_step_picture,
+    predictions_picture,
+    replay_picture,
+)
 from loopwright.pipeline.pictures.png import save
-from loopwright.pipeline.pictures.replay_pictures import replay_picture
 from loopwright.pipeline.pictures.words import scenario_name
 from loopwright.pipeline.report.worse import shipped_laws, worst_test
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX

@@ -15,8 +15,8 @@ from loopwright.pipeline.cases.own_plant import OwnCase, own_case
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.extrapolation import beyond
 from loopwright.pipeline.laws import LAWS, ControlLaw
-from loopwright.pipeline.models.base import load_model
-from loopwright.pipeline.optimal.sampled import SampledHorizon, run_sampled
+from loopwright.pipeline.models import load_model
+from loopwright.pipeline.optimal.model_bounds import SampledHorizon, run_sampled
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.serving.manifest import Signal

@@ -19,7 +19,7 @@ from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.evaluation.trials import close_loop
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models import load_model
-from loopwright.pipeline.optimal.sampled import SampledHorizon, run_sampled
+from loopwright.pipeline.optimal.model_bounds import SampledHorizon, run_sampled
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
 from loopwright.pipeline.simulation.timetable import Timetable, parse_event, timetable

@@ -13,7 +13,7 @@ from loopwright.pipeline.cases.own_plant import PERCENT, OwnCase, own_case
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.closed_loop import locked_up
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.models.base import load_model
+from loopwright.pipeline.models import load_model
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import Trajectory
 from loopwright.pipeline.simulation.timetable import parse_event, timetable

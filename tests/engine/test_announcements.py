@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from loopwright.pipeline.engine.dvc_output import Announcements, words_of
+from loopwright.pipeline.engine.parallel_dvc import Announcements, words_of
 
 ROOT = Path(__file__).parents[2]
 WORDS = {"fit": "the models of the plant"}

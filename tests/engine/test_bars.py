@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from loopwright.pipeline.engine.capture_output import BARS, MARK
-from loopwright.pipeline.engine.dvc_output import Bars
+from loopwright.pipeline.engine.parallel_dvc import Bars
 from loopwright.pipeline.engine.progress import Lines, Piece
 
 

@@ -15,7 +15,8 @@ from loopwright.pipeline.engine import pieces, start
 from loopwright.pipeline.engine.cluster import address, workers_here
 from loopwright.pipeline.engine.fingerprint import difference, fingerprint
 from loopwright.pipeline.engine.folder import Folder, apply, read_files
-from loopwright.pipeline.engine.parallel import as_done, lost, parallel_map
+from loopwright.pipeline.engine.parallel import as_done, parallel_map
+from loopwright.pipeline.engine.pieces import lost
 from loopwright.pipeline.errors import PipelineError
 
 

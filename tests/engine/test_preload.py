@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from loopwright.pipeline.engine import preload
-from loopwright.pipeline.engine.start import STAGES
+from loopwright.pipeline.engine.cluster import STAGES
 
 ROOT = Path(__file__).parents[2]
 

@@ -15,8 +15,7 @@ import pytest
 from loopwright.pipeline.cases import CASES, PLANTS
 from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export import plant_graphs as module
-from loopwright.pipeline.export.casadi_graph import casadi_graph
-from loopwright.pipeline.export.plant_graphs import plant_graphs
+from loopwright.pipeline.export.plant_graphs import casadi_graph, plant_graphs
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.manifest import Signal

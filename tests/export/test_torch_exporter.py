@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from loopwright.pipeline.export import graph, torch_exporter
+from loopwright.pipeline.export import graph
 from loopwright.pipeline.export.graph import law_graph
 from loopwright.pipeline.laws import ControlLaw
 
@@ -44,9 +44,9 @@ def lacking(law: Any, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, st
 def test_a_law_is_traced_again_only_if_it_must(
     make_formula: Make, monkeypatch: pytest.MonkeyPatch, formula: Any, traces: int
 ) -> None:
-    decomposed, law = torch_exporter._decomposed, make_formula(formula, 1, ("a",))
+    decomposed, law = graph._decomposed, make_formula(formula, 1, ("a",))
     again: list[Any] = []
-    monkeypatch.setattr(torch_exporter, "_decomposed", lambda *given: (again.append(given), decomposed(*given))[1])
+    monkeypatch.setattr(graph, "_decomposed", lambda *given: (again.append(given), decomposed(*given))[1])
 
     def stepped() -> list[np.ndarray]:
         graph._translated.cache_clear()
@@ -57,6 +57,6 @@ def test_a_law_is_traced_again_only_if_it_must(
 
     ours = stepped()
     assert len(again) == traces
-    monkeypatch.setattr(torch_exporter, "_decomposed_if_needed", torch_exporter._decomposed)
+    monkeypatch.setattr(graph, "_decomposed_if_needed", graph._decomposed)
     np.testing.assert_array_equal(ours, stepped())
     assert len(again) == traces + 1

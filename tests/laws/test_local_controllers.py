@@ -15,8 +15,7 @@ from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.laws import LAWS
-from loopwright.pipeline.laws.local.local_controllers import LocalControllers
-from loopwright.pipeline.laws.local.local_stability import StabilityTest
+from loopwright.pipeline.laws.local.local_controllers import LocalControllers, StabilityTest
 from loopwright.pipeline.laws.local.pid_networks import one_knob
 from loopwright.pipeline.plants.linearization import Linearization
 from loopwright.pipeline.tuning.rules import PidSettings, sampled_loop

@@ -19,8 +19,15 @@ from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models import MODELS, load_model
 from loopwright.pipeline.models.base import simulate
 from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_identification import LEAST, Rules, Transitions, identify
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart, coefficients, gap
+from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import (
+    LEAST,
+    HybridFuzzyPart,
+    Rules,
+    Transitions,
+    coefficients,
+    gap,
+    identify,
+)
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
 

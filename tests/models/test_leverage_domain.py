@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.models.base import load_model
+from loopwright.pipeline.models import load_model
 from loopwright.pipeline.models.static.leverage_domain import LeverageDomain
 
 seeds = st.integers(0, 10_000)

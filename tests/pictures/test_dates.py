@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from loopwright.pipeline.historian.files.time_stamps import UNSTATED, Clock, clock_of, zone_of
-from loopwright.pipeline.pictures.dates import ExportTimes
+from loopwright.pipeline.pictures.screening_pictures import ExportTimes
 
 START_S = datetime(2024, 3, 4, 6, tzinfo=UTC).timestamp()
 

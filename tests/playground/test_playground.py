@@ -21,13 +21,13 @@ from loopwright.pipeline.commands.playground import page_of
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.files import sha256
 from loopwright.pipeline.playground import web_runtime as runtime
-from loopwright.pipeline.playground.server import file_server
 from loopwright.pipeline.playground.site import (
     LOOP,
     OPERATORS,
     SHARED,
     STATIC,
     Playground,
+    file_server,
     write_folder,
     write_one_file,
 )

@@ -16,8 +16,14 @@ from kits import SHIPPED, name
 
 from loopwright.pipeline.cases import PLANTS
 from loopwright.pipeline.errors import HostError
-from loopwright.pipeline.hosts.fmu.description import build_description, description, token_of
-from loopwright.pipeline.hosts.fmu.folder import identifier_of, pack, write_folder
+from loopwright.pipeline.hosts.fmu.folder import (
+    build_description,
+    description,
+    identifier_of,
+    pack,
+    token_of,
+    write_folder,
+)
 from loopwright.pipeline.hosts.fmu.gate import check, problems
 from loopwright.pipeline.hosts.fmu.variables import variables_of
 from loopwright.serving import Controller

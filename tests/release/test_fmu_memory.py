@@ -13,7 +13,7 @@ import pytest
 from controller_fmus import MISSING, answers_of, controller_of, tools, unpacked
 
 from loopwright.pipeline.hosts.fmu.compiling import HOSTS, SOURCES
-from loopwright.pipeline.hosts.fmu.description import token_of
+from loopwright.pipeline.hosts.fmu.folder import token_of
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)

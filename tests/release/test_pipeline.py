@@ -17,8 +17,8 @@ import pytest
 import yaml
 from processes import within
 
+from loopwright.pipeline.engine.cluster import STAGES
 from loopwright.pipeline.engine.dvc import COMMAND, PYTHON
-from loopwright.pipeline.engine.start import STAGES
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from reduced import reduced

@@ -24,8 +24,7 @@ from chromium import CHROMIUM
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.commands.playground import page_of
 from loopwright.pipeline.plants.simulator import Array
-from loopwright.pipeline.playground.server import file_server
-from loopwright.pipeline.playground.site import write_folder, write_one_file
+from loopwright.pipeline.playground.site import file_server, write_folder, write_one_file
 from loopwright.pipeline.playground.web_runtime import kept
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.serving import Controller, ControlLoop, Mode, Sample

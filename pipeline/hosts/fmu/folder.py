@@ -2,19 +2,161 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 import shutil
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
 
 from loopwright.pipeline.errors import HostError
 from loopwright.pipeline.hosts.fmu.compiling import HOSTS, SOURCES, Toolchain
-from loopwright.pipeline.hosts.fmu.description import build_description, description, page
+from loopwright.pipeline.hosts.fmu.variables import Variable, in_xml, variables_of
 from loopwright.pipeline.plants.fmu.description import fmpy
 from loopwright.serving.controller import Controller
 from loopwright.serving.controller_file import file_digest
 
+LOG = {
+    "logStatusError": "why a call failed",
+    "logStatusWarning": "why a sample was refused; only with logging on",
+}
+CAN_2 = {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true", "canNotUseMemoryManagementFunctions": "true"}
+CAN_3 = {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true"}
+SAMPLING = """<p>The controller samples on its own grid: at the start time and every {period:g} s after it. A sample
+takes the inputs as they stand in the communication step that holds it (its start included, its end not), and its MV is
+there at the end of that step. Between samples all outputs are held. A step longer than the period takes several
+samples of the same inputs. Steps need be no multiple of the period.</p>
+<p>A sample with an input that is not finite, or whose MV may not be used, is refused: <code>fault</code> is true, the
+last MV is held and the law's state stays as it was, until a sample is accepted again.</p>"""
+APPLIED = """<p><code>mv_applied</code> is the MV that the plant received. Until it is set in a step, and wherever the
+parameter <code>use_mv_applied</code> is false, the FMU's own last MV takes its place. A tool that writes a value, as 0,
+to an input without a connection needs <code>use_mv_applied</code> = false.</p>"""
+
+
+def token_of(controller: Controller) -> str:
+    """The guid (FMI 2.0) or instantiationToken (3.0): the first 32 digits of the file's SHA-256."""
+    h = controller.sha256
+    return f"{{{h[:8]}-{h[8:12]}-{h[12:16]}-{h[16:20]}-{h[20:32]}}}"
+
+
+def words_of(controller: Controller) -> str:
+    """One line: what the controller is."""
+    m = controller.manifest
+    return in_xml(f"Controller {m.law} of {m.case}, period {m.period_s:g} s, SHA-256 {controller.sha256}")
+
+
+def description(controller: Controller, identifier: str, fmi: int) -> bytes:
+    """modelDescription.xml for FMI 2 or 3; HostError as of ``variables_of``."""
+    rows = variables_of(controller.manifest)
+    root = Element("fmiModelDescription", fmiVersion=f"{fmi}.0", modelName=identifier)
+    root.set("guid" if fmi == 2 else "instantiationToken", token_of(controller))
+    root.set("description", words_of(controller))
+    root.set("generationTool", "Loopwright")
+    root.set("variableNamingConvention", "flat")
+    if fmi == 2:
+        root.set("numberOfEventIndicators", "0")
+    can = {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "true"}
+    SubElement(root, "CoSimulation", can | (CAN_2 if fmi == 2 else CAN_3))
+    units = SubElement(root, "UnitDefinitions")
+    for unit in sorted({row.unit for row in rows if row.unit}):
+        SubElement(units, "Unit", name=unit)
+    categories = SubElement(root, "LogCategories")
+    for name, words in LOG.items():
+        SubElement(categories, "Category", name=name, description=words)
+    SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(controller.manifest.period_s))
+    (_variables_2 if fmi == 2 else _variables_3)(root, rows)
+    return _written(root)
+
+
+def build_description(identifier: str) -> bytes:
+    """buildDescription.xml of FMI 3.0: what the sources in the FMU need."""
+    root = Element("fmiBuildDescription", fmiVersion="3.0")
+    words = "onnxruntime_c_api.h of onnxruntime 1.21 or newer is needed beside FMI's headers"
+    build = SubElement(root, "BuildConfiguration", modelIdentifier=identifier, description=words)
+    files = SubElement(build, "SourceFileSet", language="C11")
+    SubElement(files, "SourceFile", name="fmi3.c")
+    SubElement(build, "Library", name="onnxruntime", external="true", description="libonnxruntime.so.1 is in binaries")
+    return _written(root)
+
+
+def page(controller: Controller) -> bytes:
+    """documentation/index.html."""
+    m, rows = controller.manifest, variables_of(controller.manifest)
+    cells = "".join(
+        f"<tr><td>{html.escape(r.name)}</td><td>{r.causality}</td><td>{html.escape(r.unit)}</td>"
+        f"<td>{'' if r.low is None else f'{r.low:g} to {r.high:g}'}</td>"
+        f"<td>{'' if r.start is None else f'{r.start:g}'}</td><td>{html.escape(r.words)}</td></tr>\n"
+        for r in rows
+    )
+    title = html.escape(words_of(controller))
+    applied = APPLIED if "mv_applied" in m.inputs else ""
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title>\n<h1>{title}</h1>\n'
+        f"{SAMPLING.format(period=m.period_s)}\n{applied}\n"
+        "<table>\n<tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>what it is</th>"
+        f"</tr>\n{cells}</table>\n<p>The FMU holds onnxruntime's library of one platform. sources/ has what was"
+        " compiled for it; the licences are in licenses/.</p>\n</html>\n"
+    ).encode()
+
+
+# ---------------------------------------------------------------------- variables in XML
+def _variables_2(root: Element, rows: list[Variable]) -> None:
+    parent = SubElement(root, "ModelVariables")
+    shown = [row for row in rows if row.causality != "independent"]  # FMI 2.0 needs none, and no tool a second time
+    for row in shown:
+        element = SubElement(parent, "ScalarVariable", _common(row))
+        SubElement(element, "Boolean" if row.boolean else "Real", _numbers(row))
+    index = {row.reference: str(k) for k, row in enumerate(shown, 1)}
+    structure = SubElement(root, "ModelStructure")
+    outputs, initial = SubElement(structure, "Outputs"), SubElement(structure, "InitialUnknowns")
+    for row in shown:
+        if row.causality == "output":
+            SubElement(outputs, "Unknown", index=index[row.reference], dependencies="")
+            before = [index[r.reference] for r in _start_of(row, rows)]
+            SubElement(initial, "Unknown", index=index[row.reference], dependencies=" ".join(before))
+
+
+def _variables_3(root: Element, rows: list[Variable]) -> None:
+    parent, structure = SubElement(root, "ModelVariables"), SubElement(root, "ModelStructure")
+    for row in rows:
+        SubElement(parent, "Boolean" if row.boolean else "Float64", _common(row) | _numbers(row))
+    outputs = [row for row in rows if row.causality == "output"]
+    for row in outputs:
+        SubElement(structure, "Output", valueReference=str(row.reference), dependencies="")
+    for row in outputs:
+        before = " ".join(str(r.reference) for r in _start_of(row, rows))
+        SubElement(structure, "InitialUnknown", valueReference=str(row.reference), dependencies=before)
+
+
+def _start_of(output: Variable, rows: list[Variable]) -> list[Variable]:
+    """The parameter that an output begins with, if it is an MV."""
+    name = output.name.removeprefix("mv.")
+    return [r for r in rows if output.group == "mv" and r.group == "mv_start" and r.name == f"mv_start.{name}"]
+
+
+def _common(row: Variable) -> dict[str, str]:
+    varies = {"output": "discrete", "parameter": "fixed"}.get(row.causality, "continuous")
+    found = {"name": row.name, "valueReference": str(row.reference), "causality": row.causality, "variability": varies}
+    return found | {"description": row.words} | ({"initial": "calculated"} if row.causality == "output" else {})
+
+
+def _numbers(row: Variable) -> dict[str, str]:
+    found = {"unit": row.unit} if row.unit else {}
+    if row.low is not None and row.high is not None:
+        found |= {"min": repr(row.low), "max": repr(row.high)}
+    if row.start is not None:
+        found["start"] = str(row.start).lower() if row.boolean else repr(row.start)
+    return found
+
+
+def _written(root: Element) -> bytes:
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n"
+
+
+# ----------------------------------------------------------------------------------------------- the content of an FMU
 MADE = (1980, 1, 1, 0, 0, 0)  # the time of every entry: the same controller gives the same bytes
 QUICK = 1  # compression: onnxruntime's library is nearly all of the file, and 9 saves a tenth of it
 LICENCES = ("LICENSE", "ThirdPartyNotices.txt")
