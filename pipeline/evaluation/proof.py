@@ -16,7 +16,6 @@ COUPLED = 0.25  # of the model's own worth, that integral action of several loop
 LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
 HINTED = 5.0  # nats, odds of 150 to 1, that suffice beside the sign by which the old loop held the plant
 BY_REGION = ("turns", "fades")  # verdicts on answers that hold by the regions of the MV's range
-AGAINST = ("opposite", "halves")  # verdicts on a region that speak for the other sign
 FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
 LITTLE = "the record leaves its sign open; beside the other answers it decides nothing, and all loops stand either"
 OLD_LOOP = "the record leaves it open; it holds by the old controller's sign, with which it held the plant"
@@ -50,16 +49,9 @@ def sign_doubts(models: Mapping[str, Metrics]) -> str:
 
 
 def turns(models: Mapping[str, Metrics]) -> bool:
-    """Whether the gain of an answer turns its sign within the range, or a region speaks against it.
-
-    A straight model has one gain: it tells of no turn, and must not stand in for a model that does.
-    """
-    for mvs in (identified_part(models).get("proof") or {}).get("answers", {}).values():
-        for found in mvs.values():
-            told = [region for region in found.get("regions") or () if not region["small"]]
-            if len({region["model"] > 0 for region in told}) > 1 or any(r["verdict"] in AGAINST for r in told):
-                return True
-    return False
+    """Whether the gain of an answer turns its sign in the range, or a region speaks against it: ``Answer.turns``."""
+    answers = (identified_part(models).get("proof") or {}).get("answers", {})
+    return any(found["turns"] for mvs in answers.values() for found in mvs.values())
 
 
 def fit_doubts(models: Mapping[str, Metrics]) -> str:

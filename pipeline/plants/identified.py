@@ -18,7 +18,7 @@ SETTLE = 2000
 STILL = 1e-10
 """Change of the scaled state in a period that is none."""
 
-NEWTON, SINGULAR, FARTHEST = 12, 1e6, 10.0
+NEWTON, SINGULAR, NEWTON_WITHIN = 12, 1e6, 10.0
 """Steps; condition of their equations beyond which a plant integrates; scaled outputs beyond which none is at rest."""
 
 
@@ -143,7 +143,9 @@ class IdentifiedPlant(Simulator):
                 return None
             if np.max(np.abs(ahead - x)) < STILL:
                 far = np.max(np.abs(x[: len(self.arrays.y_scale)]))
-                return x if far < FARTHEST and np.max(np.abs(np.linalg.eigvals(np.eye(len(x)) - gap))) < 1 else None
+                return (
+                    x if far < NEWTON_WITHIN and np.max(np.abs(np.linalg.eigvals(np.eye(len(x)) - gap))) < 1 else None
+                )
             x = x + np.linalg.solve(gap, ahead - x)
         return None
 

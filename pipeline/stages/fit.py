@@ -6,7 +6,7 @@ import shutil
 import statistics
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import ParamsError, PipelineError
 from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.known import question
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
 from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
 from loopwright.pipeline.files import write_json
@@ -34,6 +35,68 @@ Results = Mapping[tuple[int, str], tuple[str | None, dict[str, Any], Mapping[str
 """(data seed, part) -> digest of its record, figures, predictions."""
 
 
+@dataclass(frozen=True, slots=True)
+class Fits:
+    """The parts of a set, each to be learnt on every data seed."""
+
+    parts: Mapping[str, Part]
+    data: Mapping[int, Path | None]
+    case: Case
+
+    def learnt(self, shared: Shared, folder: Path, label: str) -> Results:
+        """Every part of every data seed, learnt with what they share, and saved in ``folder``."""
+        work = [(seed, part) for seed in self.data for part in self.parts]
+        learnt = parallel_map(
+            partial(_learn, self, shared, folder),
+            work,
+            f"{label}: the models, their errors and their bands",
+            in_folder=True,
+        )
+        return dict(zip(work, learnt, strict=True))
+
+    def source(self, seed: int) -> Source:
+        """What the parts of a data seed are learnt from."""
+        path, case = self.data[seed], self.case
+        record = None if path is None else Record.read(path, case.record_signals)
+        return Source(record, case.plant.signals, case.regions, seed, case.plant, known=case.known, held=case.held)
+
+    def figures(self, results: Results) -> dict[str, Any]:
+        """Each part's figures, by data seed and their median."""
+        found = {}
+        for part, description in self.parts.items():
+            per_seed = {str(seed): figures for (seed, name), (_, figures, _) in results.items() if name == part}
+            fields = {k: getattr(description, k) for k in ("task", "horizon") if hasattr(description, k)}
+            found[part] = {"kind": description.model.kind, **fields, "per_seed": per_seed, "median": _median(per_seed)}
+        return found
+
+    def proven_if_possible(self, shared: Shared, folder: Path, label: str) -> tuple[Results, dict[str, Any]]:
+        """Results and figures; of an own plant with plainer models where the record proves these and no others.
+
+        A network may bend by loads or by what no MV did. The record then refuses it, and a linear model may hold; where
+        the gain turns within the range it would hide that, and none is taken. Where the record contradicts what an
+        engineer says, it would do so with every model.
+        """
+        results = self.learnt(shared, folder, label)
+        figures = self.figures(results)
+        found, plain = {"": {"parts": figures}}, _plainer(shared)
+        proofs = self.case.on_models and self.case.stand_in == IDENTIFIED
+        if not proofs or plain is None or question(found) or turns(found) or not sign_doubts(found):
+            return results, figures
+        apart = folder / "plainer"
+        try:
+            again = self.learnt(plain, apart, f"{label}, linear, as the network is not proven")
+            others = self.figures(again)
+            found = {"": {"parts": others}}
+            if sign_doubts(found) or fit_doubts(found):
+                return results, figures
+            shutil.copytree(apart, folder, dirs_exist_ok=True)
+            return again, others
+        except (PipelineError, np.linalg.LinAlgError):
+            return results, figures
+        finally:
+            shutil.rmtree(apart, ignore_errors=True)
+
+
 def fit(name: str) -> None:
     """Train the parts of ``models.<name>`` on each data seed; write them, metrics.json and the sweep."""
     params = ModelParams.read(name)
@@ -41,62 +104,16 @@ def fit(name: str) -> None:
     parts = parts_of(params, f"models.{name}")
     folder = model_folder(params.case, params.model)
     shutil.rmtree(folder, ignore_errors=True)
-    data = data_files(params.data)
-    label = f"fit {name}"
+    fits, label = Fits(parts, data_files(params.data), case), f"fit {name}"
     needed = groundworks(parts.values())
-    shared = {seed: done(needed, _source(data, case, seed), label) for seed in data if needed}
-    results = _proven_if_possible(parts, data, case, shared, folder, label)
-    digests = {str(seed): results[seed, next(iter(parts))][0] for seed in data}
-    write_json(folder / "metrics.json", {"model": params.model, "data": digests, "parts": _figures(parts, results)})
-    for part in parts if 0 in data else ():
+    shared = {seed: done(needed, fits.source(seed), label) for seed in fits.data if needed}
+    results, figures = fits.proven_if_possible(shared, folder, label)
+    digests = {str(seed): results[seed, next(iter(parts))][0] for seed in fits.data}
+    write_json(folder / "metrics.json", {"model": params.model, "data": digests, "parts": figures})
+    for part in parts if 0 in fits.data else ():
         predictions = results[0, part][2]
         if predictions is not None:
             np.savez(folder / "predictions.npz", **predictions)
-
-
-def _proven_if_possible(
-    parts: Mapping[str, Part], data: Mapping[int, Path | None], case: Case, shared: Shared, folder: Path, label: str
-) -> Results:
-    """Every part learnt; of an own plant with plainer models where the record proves these and not the chosen ones.
-
-    A network may bend by loads or by what no MV did. The record then refuses it, and a linear model may hold; where
-    the gain turns within the range it would hide that, and none is taken.
-    """
-    results, plain = _all(parts, data, case, shared, folder, label), _plainer(shared)
-    proofs = case.on_models and case.stand_in == IDENTIFIED  # elsewhere laws are tried on the plant itself
-    if not proofs or plain is None or turns(_metrics(parts, results)) or not sign_doubts(_metrics(parts, results)):
-        return results
-    apart = folder / "plainer"
-    try:
-        again = _all(parts, data, case, plain, apart, f"{label}, linear, as the network is not proven")
-        found = _metrics(parts, again)
-        if sign_doubts(found) or fit_doubts(found):
-            return results
-        shutil.copytree(apart, folder, dirs_exist_ok=True)
-        return again
-    except (PipelineError, np.linalg.LinAlgError):
-        return results
-    finally:
-        shutil.rmtree(apart, ignore_errors=True)
-
-
-def _all(
-    parts: Mapping[str, Part],
-    data: Mapping[int, Path | None],
-    case: Case,
-    shared: Shared,
-    folder: Path,
-    label: str,
-) -> Results:
-    """Every part of every data seed, learnt and saved in ``folder``."""
-    work = [(seed, part) for seed in data for part in parts]
-    learnt = parallel_map(
-        partial(_learn, parts, data, case, shared, folder),
-        work,
-        f"{label}: the models, their errors and their bands",
-        in_folder=True,
-    )
-    return dict(zip(work, learnt, strict=True))
 
 
 def _plainer(shared: Shared) -> Shared | None:
@@ -108,21 +125,6 @@ def _plainer(shared: Shared) -> Shared | None:
         seed: {work: shared[seed][work] if plain is None else plain for work, plain in of.items()}
         for seed, of in found.items()
     }
-
-
-def _metrics(parts: Mapping[str, Part], results: Results) -> dict[str, dict[str, Any]]:
-    """The metrics of the set as those who judge the proof read them."""
-    return {"": {"parts": _figures(parts, results)}}
-
-
-def _figures(parts: Mapping[str, Part], results: Results) -> dict[str, Any]:
-    """Each part's figures, by data seed and their median."""
-    found = {}
-    for part, description in parts.items():
-        per_seed = {str(seed): figures for (seed, name), (_, figures, _) in results.items() if name == part}
-        fields = {k: getattr(description, k) for k in ("task", "horizon") if hasattr(description, k)}
-        found[part] = {"kind": description.model.kind, **fields, "per_seed": per_seed, "median": _median(per_seed)}
-    return found
 
 
 def parts_of(params: ModelParams, where: str) -> dict[str, Part]:
@@ -152,16 +154,11 @@ def data_files(data: Path) -> dict[int, Path | None]:
 
 
 def _learn(
-    parts: Mapping[str, Part],
-    data: Mapping[int, Path | None],
-    case: Case,
-    shared: Shared,
-    folder: Path,
-    item: tuple[int, str],
+    fits: Fits, shared: Shared, folder: Path, item: tuple[int, str]
 ) -> tuple[str | None, dict[str, Any], Mapping[str, Any] | None]:
     seed, name = item
-    source = replace(_source(data, case, seed), groundwork=shared.get(seed, {}))
-    learnt = parts[name].learn(source)
+    source = replace(fits.source(seed), groundwork=shared.get(seed, {}))
+    learnt = fits.parts[name].learn(source)
     learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
     if learnt.sweep is not None:
         from loopwright.pipeline.pictures.sweep_plot import draw  # here, because matplotlib takes a second to load
@@ -169,12 +166,6 @@ def _learn(
         learnt.sweep.save(folder / "sweep.json")
         draw(learnt.sweep, folder / "sweep.png")
     return None if source.record is None else source.record.digest(), learnt.metrics, learnt.predictions
-
-
-def _source(data: Mapping[int, Path | None], case: Case, seed: int) -> Source:
-    path = data[seed]
-    record = None if path is None else Record.read(path, case.record_signals)
-    return Source(record, case.plant.signals, case.regions, seed, case.plant, known=case.known, held=case.held)
 
 
 def _median(per_seed: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

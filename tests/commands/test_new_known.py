@@ -19,7 +19,7 @@ from loopwright.pipeline.historian.cleaning.tags import Tag, read_tags
 from loopwright.pipeline.historian.export_params import exported, signal_tags
 from loopwright.pipeline.historian.guessing import controlled_first, loop_in
 from loopwright.pipeline.historian.old_loops import _partner
-from loopwright.pipeline.stages.fit import _source
+from loopwright.pipeline.stages.fit import Fits
 
 ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]"]
 NEW = ["new", "tank", "x.csv", *ROLES]
@@ -51,7 +51,7 @@ def test_statements_stand_in_params_yaml_and_reach_the_fit(capsys: pytest.Captur
     )
     assert known() == wanted
     case = all_cases()["tank"]
-    assert _source({0: None}, case, 0).known == case.known == wanted
+    assert Fits({}, {0: None}, case).source(0).known == case.known == wanted
     out = capsys.readouterr().out
     assert all(one.says in out for one in wanted)
     assert "turned round" not in out

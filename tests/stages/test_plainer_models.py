@@ -11,7 +11,7 @@ import pytest
 
 from loopwright.pipeline.models.identified.structure_search import Searched, Selection, StructureSearch
 from loopwright.pipeline.models.part import Groundwork, Learnt, Part, Source, done
-from loopwright.pipeline.stages.fit import _proven_if_possible
+from loopwright.pipeline.stages.fit import Fits
 
 
 @dataclass
@@ -40,7 +40,7 @@ def answer(sign: float, *regions: float) -> dict[str, Any]:
     found = {"model": 1.0, "low": 0.8, "high": 1.2, "first": 1, "last": 5, "direct": sign, "sd": 0.1, "follows": 0.0}
     found["verdict"] = "proven" if sign > 0 else "opposite"
     told = [{**found, "from": 0.0, "to": 1.0, "small": False, "model": gain} for gain in regions]
-    return {**found, "regions": told, **({"verdict": "turns"} if told else {})}
+    return {**found, "regions": told, "turns": bool(told), **({"verdict": "turns"} if told else {})}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,8 +78,9 @@ def test_the_plainer_model_is_taken_where_the_record_proves_it_alone(
     own = {"on_models": True, "stand_in": "identified", "plant": plant, "regions": {}, "known": (), "held": {}}
     case: Any = SimpleNamespace(**own | of_case)
     shared = {0: done([part.groundwork()], Source(None, None), "")}  # type: ignore[arg-type]
-    results = _proven_if_possible({"identified": part}, {0: None}, case, shared, tmp_path, "fit")
+    results, figures = Fits({"identified": part}, {0: None}, case).proven_if_possible(shared, tmp_path, "fit")
     assert results[0, "identified"][1]["what"] == taken
+    assert figures["identified"]["per_seed"]["0"]["what"] == taken
     assert (tmp_path / "seed0" / "identified.npz").read_text() == taken
     assert not (tmp_path / "plainer").exists()
 

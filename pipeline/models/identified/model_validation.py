@@ -27,6 +27,7 @@ from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 
 PROVEN, UNCERTAIN, OPPOSITE, HALVES, SIZE = "proven", "uncertain", "opposite", "halves", "size"
+AGAINST = (OPPOSITE, HALVES)  # verdicts on a region that speak for the other sign
 TURNS, FADES = "turns", "fades"  # what holds by its regions
 CONTRARY = 2.0  # of a half of the rows, from which it speaks for the other sign
 TIMES = 3.0  # the model's answer over the one-step prediction's, or the other way round, where both are certain
@@ -64,13 +65,26 @@ class Answer:
         ``turns`` or ``fades`` where something speaks against the mean answer, but in no region against that of the
         region: it is proven or uncertain there. A proven mean does not outweigh a region of the other sign.
         """
-        told = [region for region in self.regions if not region.small]
-        against = [r.answer.verdict for r in told if r.answer.verdict in {OPPOSITE, HALVES}]
+        told = self._told
+        against = [r.answer.verdict for r in told if r.answer.verdict in AGAINST]
         if self._of_all == PROVEN:
             return against[0] if against else PROVEN
         if not told or any(r.answer.verdict not in {PROVEN, UNCERTAIN} for r in told):
             return self._of_all
         return TURNS if min(r.answer.model for r in told) < 0 < max(r.answer.model for r in told) else FADES
+
+    @property
+    def turns(self) -> bool:
+        """Whether the gain turns its sign within the range, or a region speaks for the other sign.
+
+        A straight model has one gain: it shows no turn, and must not stand in for a model that does.
+        """
+        told = self._told
+        return len({r.answer.model > 0 for r in told}) > 1 or any(r.answer.verdict in AGAINST for r in told)
+
+    @property
+    def _told(self) -> list[Region]:
+        return [region for region in self.regions if not region.small]
 
     @property
     def _of_all(self) -> str:
@@ -95,7 +109,7 @@ class Answer:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready."""
-        found = {**asdict(self), "halves": list(self.halves), "verdict": self.verdict}
+        found = {**asdict(self), "halves": list(self.halves), "verdict": self.verdict, "turns": self.turns}
         found["regions"] = [
             {"from": r.start, "to": r.end, "small": r.small, **r.answer.to_dict()} for r in self.regions
         ]

@@ -23,7 +23,7 @@ RESTS = 200
 SETTLE = 3000
 """Rests that the map is fitted to, and the most periods in which one is reached."""
 
-FARTHEST = 1e3
+STILL_WITHIN = 1e3
 """Scaled state, hidden ones included, beyond which a model has not come to rest."""
 
 FAR = 0.25
@@ -37,7 +37,7 @@ def settle(model: Dynamics, v: Array, start: Array | None = None, periods: int =
         x, moved = model.hold(x, v, 50)
         if not np.any(moved > 1e-7):
             break
-    still = (moved < 1e-5) & (np.abs(x).max(axis=1) < FARTHEST)
+    still = (moved < 1e-5) & (np.abs(x).max(axis=1) < STILL_WITHIN)
     return x, still
 
 

@@ -89,6 +89,7 @@ def proof_of(record: Record, part: IdentifiedPart = PART) -> tuple[dict[str, Any
 def test_a_gain_that_turns_is_told_with_its_regions() -> None:
     found, held, doubts = proof_of(made_plants.hammerstein(ROWS, 0.5, steady=turning))
     assert (found["verdict"], held, doubts) == ("turns", [True, True], "")
+    assert found["turns"]
     told = [of for of in found["regions"] if not of["small"]]
     assert [np.sign(of["model"]) for of in told] == [1, -1]
     assert told[0]["from"] < 30 < told[0]["to"] < 60
@@ -103,6 +104,7 @@ def test_a_gain_that_fades_ships() -> None:
     found, held, doubts = proof_of(made_plants.hammerstein(ROWS, 0.5, steady=fading))
     assert (held, doubts) == ([True, True], "")
     assert [of["small"] for of in found["regions"]] == [False, True]
+    assert not found["turns"]
     assert found["regions"][0]["model"] > 4 * abs(found["regions"][1]["model"])
 
 
