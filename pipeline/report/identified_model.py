@@ -111,7 +111,7 @@ def model_section(evidence: Evidence) -> ModelSection | None:
         return None
     mvs = [s.name for s in evidence.case.plant_class.mv_signals]
     verdicts = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs), *_dead_times(evidence, part))
-    sentences = (*verdicts, *_asked(evidence), *_one_side(evidence))
+    sentences = (*verdicts, *_noisy_disturbances(evidence, part), *_asked(evidence), *_one_side(evidence))
     judged = str((part.get("structure") or {}).get("judged") or "free run")
     return ModelSection(sentences, _variables(evidence, part), _answers(evidence, part), _tried(part), judged)
 
@@ -179,6 +179,19 @@ def _dead_times(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
     return (
         f"Dead times {' and '.join(spans)} explain the record alike. If you know the true one, say it in seconds, as "
         f"{pairs} or in column `known` of the table of tags: the controllers can then be quicker.",
+    )
+
+
+def _noisy_disturbances(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
+    """The noise of measured disturbances, of which a controller follows the level alone."""
+    found = part.get("disturbances") or {}
+    noisy = [(s, found[s.name]["noise_sd"]) for s in evidence.case.plant_class.dv_signals if s.name in found]
+    sizes = ", ".join(f"{number(sd)} {s.unit} of {s.name}".replace("  ", " ") for s, sd in noisy if sd > 0)
+    if not sizes:
+        return ()
+    return (
+        f"Measured disturbances have noise (standard deviations): {sizes}. Tests with noise have it, too; predictive "
+        "control follows their levels.",
     )
 
 

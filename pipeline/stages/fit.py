@@ -55,7 +55,7 @@ class Fits:
         return dict(zip(work, learnt, strict=True))
 
     def source(self, seed: int) -> Source:
-        """What the parts of a data seed are learnt from."""
+        """Record, signals and plant that the parts of a data seed are learnt from."""
         path, case = self.data[seed], self.case
         record = None if path is None else Record.read(path, case.record_signals)
         return Source(record, case.plant.signals, case.regions, seed, case.plant, known=case.known, held=case.held)

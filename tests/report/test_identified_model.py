@@ -11,6 +11,7 @@ import pytest
 from own_cases import two_lags
 
 from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, ModelSection, model_section
+from loopwright.serving.manifest import Signal
 
 
 def gain(sign: str, varies: float | None, rate: bool = False) -> dict[str, Any]:
@@ -162,3 +163,17 @@ def test_the_report_asks_for_a_dead_time_that_the_record_does_not_tell(
     said = [line for line in found.verdicts if "--known" in line]
     assert len(said) == asks
     assert all("y0/u0=dead" in line and "u1" not in line for line in said)
+
+
+@pytest.mark.parametrize(("sd", "says"), [(0.25, "0.25 t/h of feed"), (0.0, "")])
+def test_the_report_names_the_noise_of_measured_disturbances(
+    sd: float, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = {**PART, "disturbances": {"feed": {"noise_sd": sd}}}
+    case = two_lags()
+    monkeypatch.setattr(case.plant_class, "dv_signals", (Signal("feed", "t/h", 0.0, 9.0),))
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=case, models=models))  # type: ignore[arg-type]
+    assert found is not None
+    assert any(says in line for line in found.verdicts if "have noise" in line) == bool(says)
