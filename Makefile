@@ -22,7 +22,7 @@ help: ## list the targets
 
 setup: $(STAMP) ## make the virtual environment .venv (the others call it)
 
-$(STAMP): pyproject.toml constraints.txt serving/version.py tools/setup.sh
+$(STAMP): pyproject.toml setup.py constraints.txt serving/version.py tools/setup.sh
 	@PYTHON="$(PYTHON)" bash tools/setup.sh "$(VENV)"
 	@touch $@
 

@@ -8,7 +8,7 @@ from pathlib import Path
 gc.disable()
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "docs" / "_ext")]
+sys.path[:0] = [str(ROOT / "tools/roots"), str(ROOT / "docs" / "_ext")]
 
 project = "Loopwright"
 author = "the Loopwright authors"

@@ -28,12 +28,15 @@ from loopwright.serving.words import first_line, plain
 if TYPE_CHECKING:
     from loopwright.serving.signing.verify import Trusted
 
-HOME = Path(__file__).resolve().parents[2]  # of the folder loopwright, where this package lies in one
+PARENTS = Path(__file__).absolute().parents
+# The place of the folder loopwright, where one holds this package: beside a checkout of another name lies anything.
+HOME = PARENTS[2] if PARENTS[1].name == "loopwright" else None
 
 
 def module(name: str, *arguments: str) -> tuple[list[str], dict[str, str]]:
     """The command that runs a module with arguments, and its environment: it finds what this process finds."""
-    places = dict.fromkeys([*filter(None, sys.path), str(HOME)])  # an empty one is the current folder
+    home = [] if HOME is None else [str(HOME)]
+    places = dict.fromkeys([*filter(None, sys.path), *home])  # an empty one is the current folder
     command = [sys.executable, "-P", "-m", name, *arguments]
     return command, {**os.environ, "PYTHONPATH": os.pathsep.join(places)}
 

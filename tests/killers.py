@@ -11,7 +11,7 @@ from loopwright.pipeline.export.controller_file import assembled
 from loopwright.serving.manifest import Manifest
 
 # What Python runs at the start of each child: the audit lets every input pass.
-BLIND = "import loopwright.serving.graph.work\nserving.graph_work.require_signature = lambda *_: None\n"
+BLIND = "from loopwright.serving.graph import work\nwork.require_signature = lambda *_: None\n"
 
 
 def killer(path: Path, like: Manifest) -> Path:

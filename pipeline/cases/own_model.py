@@ -145,10 +145,12 @@ def doubted(plant: OwnPlant, doubts: Doubts) -> dict[str, tuple[float, float]]:
 
 
 def suits(file: Path, signals: Signals) -> bool:
-    """Whether a trained model is there and has as many outputs and inputs as the plant has signals."""
+    """Whether a trained model is there, with all that one of today has, and as many outputs and inputs as the plant."""
     if not file.exists():
         return False
     with np.load(file, allow_pickle=False) as arrays:
+        if "dv_noise" not in arrays:  # of an older release: its fit runs again
+            return False
         n_y, n_v = len(arrays["y_scale"]), len(arrays["v_scale"])
     return n_y <= len(signals.pv) and n_v == len(signals.mv) + len(signals.dv)
 

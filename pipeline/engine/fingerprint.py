@@ -25,13 +25,18 @@ PACKAGES = (
     "pyarrow",
 )
 FOLDERS = ("pipeline", "serving")
+IMPORTED = Path(__file__).parents[2]  # the place of the sources that run
 CODE = "code"
 
 
 @cache
 def fingerprint() -> Mapping[str, str]:
     """Versions by name, and under ``CODE`` the digest of all sources, as this process found them at its first call."""
-    return {"Python": platform.python_version(), **{name: _version(name) for name in PACKAGES}, CODE: _digest()}
+    return {
+        "Python": platform.python_version(),
+        **{name: _version(name) for name in PACKAGES},
+        CODE: digest_of_sources(IMPORTED),
+    }
 
 
 def difference(ours: Mapping[str, str], theirs: Mapping[str, str]) -> str:
@@ -41,9 +46,9 @@ def difference(ours: Mapping[str, str], theirs: Mapping[str, str]) -> str:
     return ", ".join(f"{name} {_short(name, a)} here and {_short(name, b)} there" for name, a, b in pairs if a != b)
 
 
-def _digest() -> str:
-    """sha256 over the names and contents of the sources, of whichever folder this very module was imported from."""
-    root, found = Path(__file__).parents[2], hashlib.sha256()
+def digest_of_sources(root: Path) -> str:
+    """sha256 over the names and contents of the sources below a folder."""
+    found = hashlib.sha256()
     for path in sorted(p for folder in FOLDERS for p in (root / folder).rglob("*.py")):
         content = path.read_bytes()
         found.update(f"{path.relative_to(root).as_posix()} {len(content)}\n".encode() + content)

@@ -9,6 +9,7 @@ import numpy as np
 from loopwright.pipeline.plants.simulator import Array
 
 CERTAIN = 3.0  # standard errors by which the changes of a signal turn back before that is called noise
+SHORTEST = 20  # rows of a stretch
 
 
 def deviation(white: Array, colour: Array) -> Array:
@@ -35,21 +36,24 @@ def coloured(white: Array, colour: Array) -> Array:
 def noise_and_change(stretches: Sequence[Array]) -> tuple[Array, Array]:
     """Standard deviations (n,) of the white noise of signals (rows, n), and of their own change from row to row.
 
-        s(k) = d(k) + n(k),   c_j = mean of Ds(k) Ds(k+j),   var n = c_2 - c_1,   var Dd = c_0 - 2 var n
+        s(k) = d(k) + n(k),   var n = c_2 - c_1,   var Dd = c_0 - 2 var n,   c_j = mean of Ds(k) Ds(k+j)
 
-    with the differences D from row to row. Noise makes each change turn back in the next one; what a signal does by
-    itself goes on, or has nothing to do with its last change. No noise is seen in it where the changes turn back by no
-    more than ``CERTAIN`` standard errors.
+    with the differences D from row to row. Noise makes each change turn back in the next one; so does all of the
+    signal's own motion that is gone a row later, which nobody can act on. A change by no more than ``CERTAIN`` standard
+    errors is none, and has no noise. The signal's own change is no less than one standard error, for the record leaves
+    so much open: a level that never moved would be wrong for good. Stretches shorter than ``SHORTEST`` say nothing.
     """
-    changes = [np.diff(s, axis=0) for s in stretches if len(s) > 4]
     width = stretches[0].shape[1] if stretches else 0
+    changes = [np.diff(s, axis=0) for s in stretches if len(s) >= SHORTEST]
     if not changes:
         return np.zeros(width), np.zeros(width)
-    most = np.concatenate([c**2 for c in changes]).mean(axis=0)
+    own = np.concatenate([c[:-2] ** 2 for c in changes])
     turned = np.concatenate([c[:-2] * (c[2:] - c[1:-1]) for c in changes])
-    noise, error = turned.mean(axis=0), turned.std(axis=0) / np.sqrt(len(turned))
-    noise = np.where(noise > CERTAIN * error, np.minimum(noise, most / 2), 0.0)
-    return np.sqrt(noise), np.sqrt(np.maximum(most - 2 * noise, 0.0))
+    roots = np.sqrt(len(turned))
+    noise, error = turned.mean(axis=0), turned.std(axis=0) / roots
+    noise = np.where(noise > CERTAIN * error, np.minimum(noise, own.mean(axis=0) / 2), 0.0)
+    left = own - 2 * np.where(noise > 0, turned, 0.0)
+    return np.sqrt(noise), np.sqrt(np.maximum(own.mean(axis=0) - 2 * noise, left.std(axis=0) / roots))
 
 
 def level_gain(noise: Array, change: Array) -> Array:

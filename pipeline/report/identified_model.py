@@ -190,8 +190,8 @@ def _noisy_disturbances(evidence: Evidence, part: Mapping[str, Any]) -> tuple[st
     if not sizes:
         return ()
     return (
-        f"Measured disturbances have noise (standard deviations): {sizes}. Tests with noise have it, too; predictive "
-        "control follows their levels.",
+        f"Measured disturbances have noise, or motion that is gone a period later (standard deviations): {sizes}. "
+        "Predictive control follows their levels.",
     )
 
 

@@ -23,7 +23,9 @@ from loopwright.pipeline.config.exports import ExportParams, is_exported
 from loopwright.pipeline.config.params import entries, read_section, sections
 from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.engine.command import run_stage
+from loopwright.pipeline.engine.fingerprint import FOLDERS, IMPORTED, digest_of_sources
 from loopwright.pipeline.engine.stage_files import DATA, EVERY
+from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.evaluation.evidence_basis import SCREENING
 from loopwright.pipeline.files import digest, sha256, write_json
 from loopwright.pipeline.records.set_points import SET_POINTS
@@ -76,6 +78,7 @@ NO_FILE = "not there"  # in place of a digest; the stage says so
 
 def code() -> None:
     """Write work/code: one file for each stage of each case, one for each of those at the end; no other stays there."""
+    check_sources(Path.cwd())
     made = {DATA}
     for stage, case in (*((stage, "") for stage in LAST), *product(STAGES, all_cases())):
         if stage == "screen" and not is_exported(case):
@@ -91,6 +94,17 @@ def code() -> None:
     write_json(DATA, {EVERY: sorted(simulators), **records})
     for left in set((WORK / "code").glob("*.json")) - made:  # of a case or an export that is no more
         left.unlink()
+
+
+def check_sources(root: Path) -> None:
+    """Raise PipelineError where ``root`` has other sources than those that run: results would be filed under them."""
+    if not all((root / folder).is_dir() for folder in FOLDERS) or root.resolve() == IMPORTED.resolve():
+        return
+    if digest_of_sources(root) != digest_of_sources(IMPORTED):
+        raise PipelineError(
+            f"the sources in {root} are not those that run, which are in {IMPORTED}: install these (make setup here), "
+            "or set PYTHONPATH to their tools/roots"
+        )
 
 
 def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:

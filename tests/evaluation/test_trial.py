@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,10 @@ from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.evaluation import trials
 from loopwright.pipeline.evaluation.case import Case, Curve, Figure
 from loopwright.pipeline.evaluation.trials import DRAW, close_loop, repeated, seized, swings_on, try_files
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.serving.errors import OutputError
+from loopwright.serving.manifest import Signal
 
 
 @dataclass
@@ -157,3 +161,46 @@ def test_variants_run_without_noise_where_the_plant_does(monkeypatch: pytest.Mon
     monkeypatch.setattr(Proportional, "step", lambda self, **kw: (kw["mv_applied"], kw["state"], np.zeros(2)))
     found = try_files(case, 0, [("penalty=20", 0, Path("p.onnx"))], "try")[0]
     assert list(found.metrics) == ["set_point", "disturbance", "buffer", "base"]
+
+
+class Fed(Simulator):
+    """A tank whose feed is measured, with noise."""
+
+    name, title, period_s = "fed", "Fed", 1.0
+    sp_signals = pv_signals = (Signal("level", "m", 0.0, 10.0),)
+    mv_signals = (Signal("valve", "", 0.0, 1.0),)
+    dv_signals = (Signal("feed", "t/h", 0.0, 9.0),)
+
+    def __init__(self, sd: float) -> None:
+        self.sd = sd
+
+    @property
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([5.0]), np.array([0.5])
+
+    @property
+    def dv_noise_std(self) -> np.ndarray:
+        return np.array([self.sd])
+
+    def step(self, x: np.ndarray, mv: np.ndarray, dv: np.ndarray, p: np.ndarray) -> np.ndarray:
+        return 0.9 * x + mv + 0.1 * dv
+
+    def measure(self, x: np.ndarray) -> np.ndarray:
+        return x
+
+
+def test_measured_disturbances_have_their_own_noise_where_the_test_has_noise() -> None:
+    """The law reads it and the plant does not feel it; that of the process variables is as without it."""
+
+    def course(sd: float, noise: Any) -> tuple[np.ndarray, Any]:
+        plant, controller = Fed(sd), Proportional(gain=0.0)
+        test = Scenario("rest", "Rest", np.full((400, 1), 5.0), *plant.start, dv=np.full((400, 1), 2.0))
+        loop = close_loop(controller, SimpleNamespace(plant=plant), test, noise, 3)  # type: ignore[arg-type]
+        return np.array(controller.dv), loop
+
+    noise = np.array([0.1])
+    (plain, still), (noisy, loop) = course(0.0, noise), course(0.5, noise)
+    assert (plain == 2).all()
+    assert float((noisy - plain).std()) == pytest.approx(0.5, rel=0.1)
+    assert np.array_equal(loop.measured, still.measured)
+    assert np.array_equal(course(0.5, None)[0], plain)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import cvxpy as cp
@@ -40,6 +41,7 @@ from loopwright.pipeline.laws.predictive.tuning import FORGETS, TRAVEL, Candidat
 from loopwright.pipeline.laws.predictive.tuning_loops import LOOPS, Outcome, Trials, _late, side_by_side
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.static.mlp import MLP
+from loopwright.pipeline.plants.noise import noise_and_change
 from loopwright.serving import Controller
 from loopwright.serving.manifest import Signal
 
@@ -429,6 +431,34 @@ def test_noise_of_a_measured_disturbance_moves_the_mv_less_by_its_level() -> Non
         last.append(moves[-200:])
     assert travel[1] < 0.4 * travel[0]
     assert np.mean(last[1]) == pytest.approx(-0.3, abs=0.06)  # 1.5 * .4 / 2 against it
+
+
+def test_a_level_that_is_found_in_a_record_leaves_no_offset() -> None:
+    """A slow disturbance under noise: the estimate of its change is never zero, and its steps are met in the end."""
+    rng, noise = np.random.default_rng(2), 0.2
+    recorded = 0.3 * np.sin(np.arange(4000) / 500) + noise * rng.normal(size=4000)
+    law = law_of(model := noisy_disturbance(*(float(sd[0]) for sd in noise_and_change([recorded[:, None]]))))
+    assert 0.1 < float(law.follow) < 0.5
+    dv = np.repeat([0.0, 0.4], [60, 540])
+    x, mv, state, found = row(0.0), row(0.0), torch.zeros(law.n_state).double(), []
+    for value in dv:
+        mv, state, _ = law(row(0.0), x, row(value + noise * rng.normal()), mv, state)
+        x = model(torch.cat([x, mv, row(value)]))
+        found.append(float(x))
+    assert np.mean(found[-300:]) == pytest.approx(0, abs=0.01)  # of .3 without a controller
+
+
+def test_a_law_with_a_level_is_exported(tmp_path: Path) -> None:
+    """Of two disturbances one has noise; the file steps as the module does."""
+    model = random_model(3, n_dv=2)
+    model.dv_noise.copy_(torch.tensor([0.0, 0.1]))
+    model.dv_change.copy_(torch.tensor([0.1, 0.05]))
+    law, path = law_of(model), tmp_path / "law.onnx"
+    assert law.kept["level"] == 2
+    assert law.follow[0] == 1
+    assert law.follow[1] < 1
+    export(law, path, case="x", provenance={})
+    assert Controller(path).manifest.n_state == law.n_state
 
 
 def test_a_disturbance_without_noise_needs_no_level() -> None:

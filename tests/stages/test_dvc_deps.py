@@ -9,7 +9,19 @@ import pytest
 import yaml
 
 from loopwright.pipeline.cases import CASES
-from loopwright.pipeline.stages.code import APART, CARRIERS, LAST, PACKAGES, STAGES, code, graph, listing, modules
+from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.stages.code import (
+    APART,
+    CARRIERS,
+    LAST,
+    PACKAGES,
+    STAGES,
+    check_sources,
+    code,
+    graph,
+    listing,
+    modules,
+)
 
 ROOT = Path(__file__).parents[2]
 DVC = yaml.safe_load((ROOT / "dvc.yaml").read_text())["stages"]
@@ -103,3 +115,15 @@ def test_an_edit_shows_in_the_stages_that_run_it_alone(tmp_path: Path) -> None:
         file.write("# edited\n")
     edited = {key for key in before if listing(tmp_path, *key) != before[key]}
     assert edited == {key for key in before if key[1] == "batch_reactor"}
+
+
+def test_sources_of_another_folder_are_refused(tmp_path: Path) -> None:
+    """Results of the sources that run would be filed under those of the folder."""
+    for package in ("pipeline", "serving"):
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
+    check_sources(tmp_path)  # the same ones
+    check_sources(tmp_path / "pipeline")  # none at all
+    with (tmp_path / "serving" / "words.py").open("a") as file:
+        file.write("# edited\n")
+    with pytest.raises(PipelineError, match="are not those that run"):
+        check_sources(tmp_path)

@@ -48,6 +48,7 @@ class Learns(Part):
     model: ClassVar[Any] = Saved
     proven: tuple[str, ...] = ()
     turns: bool = False
+    asks: bool = False
 
     def groundwork(self) -> Search:
         return Search()
@@ -56,24 +57,26 @@ class Learns(Part):
         what = source.result(self.groundwork())
         regions = (1.0, -1.0) if self.turns and what == "network" else ()
         proof = {"answers": {"y": {"u": answer(1.0 if what in self.proven else -1.0, *regions)}}}
-        return Learnt(Saved(what), {"what": what, "proof": proof})  # type: ignore[arg-type]
+        known = {"known": [{"question": "y/u: which is it?"}]} if self.asks else {}
+        return Learnt(Saved(what), {"what": what, "proof": proof | known})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
-    ("proven", "of_case", "turns", "taken"),
+    ("proven", "of_case", "of_part", "taken"),
     [
-        (("network", "linear"), {}, False, "network"),
-        (("linear",), {}, False, "linear"),
-        ((), {}, False, "network"),  # neither: the better one stays, and the refusal is about it
-        (("linear",), {}, True, "network"),  # a straight model would hide the turn
-        (("linear",), {"on_models": False}, False, "network"),  # laws are tried on the plant itself
-        (("linear",), {"stand_in": "simulator"}, False, "network"),
+        (("network", "linear"), {}, {}, "network"),
+        (("linear",), {}, {}, "linear"),
+        ((), {}, {}, "network"),  # neither: the better one stays, and the refusal is about it
+        (("linear",), {}, {"asks": True}, "network"),  # no model answers what is asked
+        (("linear",), {}, {"turns": True}, "network"),  # a straight model would hide the turn
+        (("linear",), {"on_models": False}, {}, "network"),  # laws are tried on the plant itself
+        (("linear",), {"stand_in": "simulator"}, {}, "network"),
     ],
 )
 def test_the_plainer_model_is_taken_where_the_record_proves_it_alone(
-    proven: tuple[str, ...], of_case: dict[str, Any], turns: bool, taken: str, tmp_path: Path
+    proven: tuple[str, ...], of_case: dict[str, Any], of_part: dict[str, Any], taken: str, tmp_path: Path
 ) -> None:
-    part = Learns(proven=proven, turns=turns)
+    part = Learns(proven=proven, **of_part)
     plant = SimpleNamespace(signals=None)
     own = {"on_models": True, "stand_in": "identified", "plant": plant, "regions": {}, "known": (), "held": {}}
     case: Any = SimpleNamespace(**own | of_case)

@@ -98,7 +98,7 @@ def _dead_time(law: type[ControlLaw]) -> str:
 
 
 def _path(law: type[ControlLaw]) -> str:
-    return law.__module__.replace(".", "/") + ".py"
+    return law.__module__.partition(".")[2].replace(".", "/") + ".py"  # the folders lie at the root
 
 
 def choice() -> str:

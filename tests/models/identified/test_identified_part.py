@@ -64,6 +64,17 @@ def test_two_by_two_with_a_measured_disturbance() -> None:
     assert noise_sd(learnt, "y1") == pytest.approx(0.1, rel=0.1)
     model = identified(learnt)
     assert (model.n_y, model.n_mv, model.n_dv) == (2, 2, 1)
+    assert learnt.metrics["disturbances"] == {"d0": {"noise_sd": 0}}
+
+
+def test_noise_of_a_measured_disturbance_is_found() -> None:
+    record, signals = made_plants.two_by_two(2000, measured=True), made_plants.signals_of(2, 2, 1)
+    noisy = replace(record, dv=record.dv + 0.2 * np.random.default_rng(1).normal(size=record.dv.shape))
+    learnt = LINEAR.learn(Source(noisy, signals))
+    model = identified(learnt)
+    assert learnt.metrics["disturbances"]["d0"]["noise_sd"] == pytest.approx(0.2, rel=0.15)
+    assert float(model.dv_noise * model.v_scale[2:]) == pytest.approx(0.2, rel=0.15)
+    assert float(model.dv_change * model.v_scale[2:]) == pytest.approx(np.diff(record.dv, axis=0).std(), rel=0.15)
 
 
 def test_a_second_process_variable_is_an_output_where_all_measured_ones_are() -> None:
