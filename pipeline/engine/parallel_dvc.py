@@ -50,7 +50,7 @@ SKIPPED = re.compile(r"Stage '([^']+)' didn't change, skipping$")
 FAILED = re.compile(r"ERROR: failed to reproduce '([^']+)': failed to run: .*, exited with (\d+)$")
 # What DVC says of its own files, and of git.
 ASIDE = re.compile(
-    r"(> python -m pipeline\.|(Generating|Updating) lock file|To track the changes with git|\tgit add |"
+    r"(> python -m loopwright\.|(Generating|Updating) lock file|To track the changes with git|\tgit add |"
     r"To enable auto staging|\tdvc config core\.autostage|Use `dvc push`|WARNING: Process '.* had been killed)"
 )
 

@@ -20,7 +20,7 @@ from loopwright.pipeline.evaluation.law_evidence import BASE, Cycle
 from loopwright.pipeline.evaluation.metric import mean_of_draws, together
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
-from loopwright.pipeline.simulation.simulate import DV_DRAW, Trajectory, disturbance_noise, simulate_closed
+from loopwright.pipeline.simulation.simulate import DV_DRAW, Trajectory, noise_of_disturbances, simulate_closed
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopwrightError
 from loopwright.serving.manifest import Signal
@@ -148,7 +148,7 @@ def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array 
     plant, state = test.plant or case.plant, controller.cold_state()
     disturbances = test.disturbances(plant)
     if noise is not None:
-        disturbances = disturbances + disturbance_noise(plant, test.samples, np.random.default_rng([seed, DV_DRAW]))
+        disturbances = disturbances + noise_of_disturbances(plant, test.samples, np.random.default_rng([seed, DV_DRAW]))
     measured = iter(disturbances)
     n_info = len(controller.manifest.info)
 

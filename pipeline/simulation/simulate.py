@@ -115,7 +115,7 @@ def noise_draws(plant: Simulator, n: int, noise: Sequence[float] | Array | None,
     return coloured(rng.standard_normal((n, len(names))), plant.noise_colour) * std
 
 
-def disturbance_noise(plant: Simulator, n: int, rng: np.random.Generator, size: float = 1.0) -> Array:
+def noise_of_disturbances(plant: Simulator, n: int, rng: np.random.Generator, size: float = 1.0) -> Array:
     """Noise (n, n_dv) of the measured disturbances, ``size`` times the plant's ``dv_noise_std``, white."""
     return size * plant.dv_noise_std * rng.standard_normal((n, len(plant.dv_signals)))
 

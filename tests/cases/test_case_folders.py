@@ -12,7 +12,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 ROOT = Path(__file__).parents[2]
-FOLDERS = {case.name: ROOT.joinpath(*type(case).__module__.split(".")[:-1]) for case in CASES.values()}
+FOLDERS = {case.name: ROOT.joinpath(*type(case).__module__.split(".")[1:-1]) for case in CASES.values()}
 SOURCES = [
     path
     for package in ("pipeline", "serving")

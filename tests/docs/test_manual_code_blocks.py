@@ -145,7 +145,7 @@ def _check_python(rest: list[str], block: Block) -> None:
     if rest[0] == "-m":
         assert rest[1] in {
             "venv",
-            "serving",
+            "loopwright.serving",
             "loopwright.pipeline.engine.start",
             "loopwright.pipeline.playground.web_runtime",
         }, block.where

@@ -194,7 +194,7 @@ def test_no_error_class_is_missing() -> None:
 
 def test_the_python_api_names_all_that_a_host_may_import() -> None:
     text = (DOCS / "reference" / "api.md").read_text(encoding="utf-8")
-    documented = re.findall(r"^\.\. auto\w+:: serving\.(\w+)$", text, re.MULTILINE)
+    documented = re.findall(r"^\.\. auto\w+:: loopwright\.serving\.(\w+)$", text, re.MULTILINE)
     assert sorted(documented) == sorted(serving.__all__)
 
 

@@ -390,7 +390,7 @@ def test_a_run_has_the_times_of_its_stage(root):
 
 
 def test_a_stage_under_dvc_leaves_a_receipt_that_fits_its_files(tmp_path):
-    package, sources = tmp_path / "pipeline", Path(pipeline.__file__).parent
+    package, sources = tmp_path / "loopwright" / "pipeline", Path(pipeline.__file__).parent
     for room in ("stages", "engine"):
         (package / room).mkdir(parents=True)
         (package / room / "__init__.py").touch()

@@ -13,7 +13,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.stress.faults import Fault, draw_fault
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.scenario import Scenario
-from loopwright.pipeline.simulation.simulate import DV_DRAW, disturbance_noise, noise_draws
+from loopwright.pipeline.simulation.simulate import DV_DRAW, noise_draws, noise_of_disturbances
 
 NOISE = (0.5, 2.0)  # times the case's measurement noise
 LATE = 0.5  # share of the loops with one more sample of dead time
@@ -44,7 +44,7 @@ class Draw:
     def dv_deviation(self, plant: Simulator) -> Array:
         """The noise (n, n_dv) of the measured disturbances."""
         rng = np.random.default_rng((*self.noise_seed, DV_DRAW))
-        return disturbance_noise(plant, self.scenario.samples, rng, self.noise)
+        return noise_of_disturbances(plant, self.scenario.samples, rng, self.noise)
 
     def quantities(self) -> dict[str, float]:
         """All that was drawn as numbers, by the words of the report."""
