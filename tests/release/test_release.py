@@ -94,18 +94,21 @@ def test_a_wheel_holds_the_modules_and_what_they_open(wheel: Path) -> None:
     assert wheel.name == f"loopwright-{serving.__version__}-py3-none-any.whl"
     assert not [n for n in names if "bounds" in n and n.endswith(".json")]
     assert not [n for n in names if n.startswith("tests") or "/test_" in n]
-    assert {"serving/page/static/uPlot.iife.min.js", "pipeline/report/templates/report.html.j2"} <= names
+    assert {
+        "loopwright/serving/page/static/uPlot.iife.min.js",
+        "loopwright/pipeline/report/templates/report.html.j2",
+    } <= names
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
         (lambda n: n | {"tests/test_x.py"}, "tests/test_x.py: does not belong"),
-        (lambda n: n | {"pipeline/cases/tank/bounds.json"}, "bounds.json: does not belong"),
-        (lambda n: n | {"serving/left_over.py"}, "serving/left_over.py: does not belong"),
-        (lambda n: n | {"serving/page/static/secret.pem"}, "secret.pem: does not belong"),
-        (lambda n: n - {"serving/loop.py"}, "serving/loop.py: not in the wheel"),
-        (lambda n: n - {"serving/py.typed"}, "serving/py.typed: not in the wheel"),
+        (lambda n: n | {"loopwright/pipeline/cases/tank/bounds.json"}, "bounds.json: does not belong"),
+        (lambda n: n | {"loopwright/serving/left_over.py"}, "loopwright/serving/left_over.py: does not belong"),
+        (lambda n: n | {"loopwright/serving/page/static/secret.pem"}, "secret.pem: does not belong"),
+        (lambda n: n - {"loopwright/serving/loop.py"}, "loopwright/serving/loop.py: not in the wheel"),
+        (lambda n: n - {"loopwright/serving/py.typed"}, "loopwright/serving/py.typed: not in the wheel"),
     ],
 )
 def test_what_does_not_belong_or_is_lost_is_named(
@@ -119,10 +122,10 @@ def test_what_does_not_belong_or_is_lost_is_named(
 
 def test_a_runtime_that_names_a_case_is_found(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "x.whl", "w") as made:
-        made.writestr("serving/loop.py", "if case == 'thiosulfate_cstr': ...")
-        made.writestr("pipeline/laws/x.py", "thiosulfate_cstr")
+        made.writestr("loopwright/serving/loop.py", "if case == 'thiosulfate_cstr': ...")
+        made.writestr("loopwright/pipeline/laws/x.py", "thiosulfate_cstr")
     with zipfile.ZipFile(tmp_path / "x.whl") as held:
-        assert module("content").named_cases(held) == ["serving/loop.py: names a case"]
+        assert module("content").named_cases(held) == ["loopwright/serving/loop.py: names a case"]
 
 
 def test_the_source_archive_has_what_the_wheel_leaves_out(dist: Path) -> None:
