@@ -47,4 +47,4 @@ def test_formulas_diagrams_and_tables_are_in_the_pages(manual: Path) -> None:
     assert 0 < keys.index("transfer_s") < keys.index("watchdog_scans") < keys.index("recover_after")
     api = (manual / "docs" / "reference" / "api.html").read_text(encoding="utf-8")
     wanted = ("ControlLoop.set_sp", "Controller.step", "Controller.cold_state")  # the last two are inherited
-    assert [name for name in wanted if f'id="serving.{name}"' not in api] == []
+    assert [name for name in wanted if f'id="loopwright.serving.{name}"' not in api] == []
