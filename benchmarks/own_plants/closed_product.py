@@ -24,7 +24,7 @@ from torch import Tensor
 
 from loopwright.pipeline.commands import new
 from loopwright.pipeline.commands.own_plant.from_export import asked, given_tags
-from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
+from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, wants_a_plainer_model
 from loopwright.pipeline.historian.cleaning.tags import named
 from loopwright.pipeline.historian.export_params import screened_export, with_units
 from loopwright.pipeline.historian.guessing import controlled_first
@@ -138,7 +138,7 @@ def fitted(found: Read, minutes: float | None = None) -> tuple[Identified, str]:
     searched = work.done(source, work.kind)
     model, metrics = _learnt(part, source, searched)
     doubts, plain = sign_doubts(metrics), work.plainer(searched)
-    if not doubts or plain is None or turns(metrics):
+    if plain is None or not wants_a_plainer_model(metrics):
         return model, doubts
     other, metrics = _learnt(part, source, plain)
     return (model, doubts) if sign_doubts(metrics) or fit_doubts(metrics) else (other, "")

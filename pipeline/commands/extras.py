@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
-from importlib.metadata import PackageNotFoundError, requires
+from importlib.metadata import PackageNotFoundError, distributions, requires
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 NAME = "loopwright"
 # Packages that are imported under another name than they are installed under.
@@ -14,7 +17,20 @@ OWN = ("dev",)  # which tests loopwright itself
 def advice(module: str) -> str | None:
     """The extra that brings a module that is not installed, as the end of an error; None where no extra does."""
     extra = extra_of(module)
-    return f"{module.partition('.')[0]} is not installed; pip install '{NAME}[{extra}]' brings it" if extra else None
+    source = _clone() or NAME
+    how = "-e " if source != NAME else ""
+    return (
+        f"{module.partition('.')[0]} is not installed; pip install {how}'{source}[{extra}]' brings it"
+        if extra
+        else None
+    )
+
+
+def _clone() -> str | None:
+    """Folder of the sources that loopwright is installed from where they stand; None of a wheel."""
+    installed = [json.loads(found.read_text("direct_url.json") or "{}") for found in distributions(name=NAME)]
+    urls = [said["url"] for said in installed if said.get("dir_info", {}).get("editable")]
+    return url2pathname(urlsplit(urls[0]).path) if urls else None
 
 
 def extra_of(module: str) -> str | None:

@@ -35,7 +35,10 @@ def _list(args: argparse.Namespace) -> None:
                 # Whoever can write the store can write its tags.
                 print(plain(f"{row:70}  signed by {signer}" if signer else row))
         if not models:
-            print("the registry is empty: `loopwright run` fills it; a clone holds no results to publish until then")
+            print(
+                "the registry is empty: `loopwright registry publish` fills it with what runs have made here, and "
+                "`loopwright run` of all that params.yaml lists ends with it; a clone holds none until its first run"
+            )
 
 
 def _promote(args: argparse.Namespace) -> None:

@@ -51,7 +51,11 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--from", metavar="CV", type=real("a finite number"), dest="start",
         help="start at the steady state of this CV")  # fmt: skip
     events("--disturbance", "NAME=VALUE[@S]", "measured disturbance or plant parameter from time S on")
-    events("--noise", "PV=STD", "standard deviation of a measurement's noise, over the whole run")
+    events(
+        "--noise",
+        "PV=STD",
+        "standard deviation of a reading's noise, of a measured disturbance too, over the whole run",
+    )
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip
     add("--duration", metavar="S", type=positive("s"), help="length of the run")

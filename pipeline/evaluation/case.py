@@ -310,6 +310,4 @@ class Case(ABC):
             return statistics.fmean(errors) if errors else math.nan
         # An error of none counts as the least of the others: no sequence decides alone.
         least = min((error for error in errors if error > 0), default=0.0)
-        if not least:
-            return sum(errors)
-        return float(np.exp(np.log(np.maximum(errors, least)).mean()))
+        return float(statistics.geometric_mean(np.maximum(errors, least))) if least else sum(errors)

@@ -118,6 +118,10 @@ METRICS: dict[str, Metric] = {
         Metric("overshoot", "overshoot", "mean overshoot of the steps"),
         Metric("settling", "settling time", "median settling time", "s"),
         Metric("mv_travel", "MV travel", "travel of the MVs"),
+        # Of a PID's analysis.
+        Metric("kc", "Kc", "gain of the PID, ideal form, in units of MV and CV"),
+        Metric("ti_s", "Ti", "integral time of the PID", "s"),
+        Metric("td_s", "Td", "derivative time of the PID", "s"),
         # Of the bounds alone.
         Metric("failures", "failures", "plans that were not solved", together="sum"),
         Metric("from_nmpc", "taken from the NMPC", "plans for which the NMPC's figures stand", together="sum"),

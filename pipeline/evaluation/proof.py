@@ -48,6 +48,15 @@ def sign_doubts(models: Mapping[str, Metrics]) -> str:
     return f"not proven: the model's gain is uncertain in sign ({found}); {REMEDY}"
 
 
+def wants_a_plainer_model(models: Mapping[str, Metrics]) -> bool:
+    """Whether a linear model may be proven where a network is not.
+
+    A network may bend by loads or by what no MV did. Where the gain turns within the range a linear model would hide
+    that, and where the record contradicts what an engineer says, it would do so with every model.
+    """
+    return bool(sign_doubts(models)) and not question(models) and not turns(models)
+
+
 def turns(models: Mapping[str, Metrics]) -> bool:
     """Whether the gain of an answer turns its sign in the range, or a region speaks against it: ``Answer.turns``."""
     answers = (identified_part(models).get("proof") or {}).get("answers", {})

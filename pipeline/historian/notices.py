@@ -13,7 +13,7 @@ from loopwright.pipeline.historian.cleaning.findings import Finding, Verdict, co
 from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.outliers_and_units import noise_sd, usual
 from loopwright.pipeline.historian.cleaning.sampling import Sampling, sampling, whole_multiple
-from loopwright.pipeline.historian.cleaning.tag_checks import PERCENT
+from loopwright.pipeline.historian.cleaning.tag_checks import VALVE_RANGE
 from loopwright.pipeline.historian.cleaning.tags import SIGNAL_ROLES, Tag
 from loopwright.pipeline.historian.excitation import HELD
 from loopwright.pipeline.historian.files.export import Export, Series
@@ -52,7 +52,7 @@ def _ends(levels: Sequence[float], tag: Tag | None) -> bool:
         return False
     low, high = (None, None) if tag is None else (tag.low, tag.high)
     if tag is not None and tag.unit == "%":
-        low, high = (PERCENT[0] if low is None else low), (PERCENT[1] if high is None else high)
+        low, high = (VALVE_RANGE[0] if low is None else low), (VALVE_RANGE[1] if high is None else high)
     at_ends = low is not None and high is not None and _near(levels, (low, high))
     return at_ends or any(_near(levels, ends) for ends in SWITCHED)
 

@@ -161,7 +161,7 @@ class Windows:
         return Windows(self.moved[use::3], self.parts[use::3])
 
     def asked(self) -> Windows:
-        """Those in which the set point moves: they alone tell how the law answers to it."""
+        """Windows in which the set point moves: they alone tell how the law answers to it."""
         moves = np.abs(self.parts[..., 1]).max(axis=1) > 0
         return Windows(self.moved[moves], self.parts[moves])
 

@@ -105,7 +105,7 @@ class LoopPanels:
         self.dvs: list[Axes] = panels[len(panels) - len(self.moved) :]
         self.error: Axes | None = panels[len(cvs)] if late_from else None
         self.bottom = panels[-1]
-        self.cvs[0].set_title(title)
+        self.cvs[0].set_title(title, wrap=True)
         for axes, cv in zip(self.cvs, cvs, strict=True):
             axes.set_ylabel(signal_label(cv))
         for (i, owner), axes in self.mvs.items():

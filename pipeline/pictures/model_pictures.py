@@ -51,7 +51,7 @@ def predictions_picture(evidence: Evidence, figure: Figure) -> Canvas:
     # No line: a random split leaves samples that do not follow one another.
     axes[0].plot(time_s[:n], actual[:n], "o", color="black", markersize=5, fillstyle="none", label="applied")
     axes[0].plot(time_s[:n], predicted[:n], ".", color=PREDICTED, markersize=4, label="predicted")
-    axes[0].set_title(f"Figure {figure.number}. {figure.title}")
+    axes[0].set_title(f"Figure {figure.number}. {figure.title}", wrap=True)
     axes[0].set_xlabel("time [s]")
     mv = evidence.case.plant_class.mv_signals[0]
     axes[0].set_ylabel(signal_label(mv))
@@ -78,7 +78,7 @@ def one_step_picture(evidence: Evidence, figure: Figure) -> Canvas:
     time, words = time_axis(np.ravel(arrays["time_s"]))
     for axes, group in zip(panels, groups, strict=True):
         _one_step_panel(axes, time, arrays, group)
-    panels[0].set_title(f"Figure {figure.number}. {figure.title}")
+    panels[0].set_title(f"Figure {figure.number}. {figure.title}", wrap=True)
     panels[-1].set_xlabel(words)
     return canvas
 
@@ -121,7 +121,7 @@ def candidates_picture(table: Mapping[str, Any], unit: str) -> Canvas:
     axes.set_xlabel("past outputs, past inputs | hidden units, by number of parameters")
     axes.set_xticks(at, [f"{row['lags']} | {row['hidden']}" for row in rows], rotation=35, ha="right", fontsize="small")
     axes.margins(x=0.1, y=0.18)
-    axes.set_title(f"Candidates of {table['model']}, {table['part']}")
+    axes.set_title(f"Candidates of {table['model']}, {table['part']}", wrap=True)
     canvas.legend(loc="outside lower center", ncols=2)
     return canvas
 
@@ -153,7 +153,7 @@ def replay_picture(evidence: Evidence, law: str) -> Canvas:
         axes.step(time, rows["done"][:, i], where="post", color=DONE, linewidth=1.6, label="done")
         axes.step(time, rows["asked"][:, i], where="post", color=colour, linewidth=1.0, label="asked by the law")
         axes.set_ylabel(signal_label(signal))
-    panels[0].set_title(f"{law_name(law)} over the record, nothing fed back")
+    panels[0].set_title(f"{law_name(law)} over the record, nothing fed back", wrap=True)
     panels[-1].set_xlabel(f"{words}, counted over the rows shown; gaps of the record are closed")
     panels[-1].margins(x=0.01)
     canvas.align_ylabels(panels)

@@ -39,7 +39,7 @@ def loop_canvas(plant: Simulator, draw: Draw, loop: Trajectory, title: str) -> C
             if fault is not None and fault.kind == STUCK and fault.mv == j:
                 last = min(fault.end, len(time) - 1)
                 axes.axvspan(time[fault.start], time[last], color=GOLD, alpha=0.25, label="stuck")
-        panels[0].set_title(title)
+        panels[0].set_title(title, wrap=True)
         panels[-1].set_xlabel(words)
         for axes in panels:
             axes.margins(x=0.01)

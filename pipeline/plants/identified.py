@@ -143,9 +143,8 @@ class IdentifiedPlant(Simulator):
                 return None
             if np.max(np.abs(ahead - x)) < STILL:
                 far = np.max(np.abs(x[: len(self.arrays.y_scale)]))
-                return (
-                    x if far < NEWTON_WITHIN and np.max(np.abs(np.linalg.eigvals(np.eye(len(x)) - gap))) < 1 else None
-                )
+                returns = np.max(np.abs(np.linalg.eigvals(np.eye(len(x)) - gap))) < 1
+                return x if returns and far < NEWTON_WITHIN else None
             x = x + np.linalg.solve(gap, ahead - x)
         return None
 

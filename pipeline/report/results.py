@@ -35,7 +35,10 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console = Console(file=console.file, width=WIDTH)
     folders = sorted(path.parent for path in artifacts.glob("*/validation.json"))
     if not folders:
-        raise PipelineError(f"{artifacts} holds no validation.json yet; run the pipeline first: make run")
+        raise PipelineError(
+            f"{artifacts.absolute()} holds no results; run the pipeline first (loopwright run), or go to the folder in "
+            "which it ran"
+        )
     standings = {folder.name: Standing.read(folder) for folder in folders}
     if case is not None and case not in standings:
         raise PipelineError(f"{artifacts} holds no case {case!r}; it has {', '.join(standings)}")

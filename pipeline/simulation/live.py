@@ -49,8 +49,9 @@ class SimulatedPlant:
         return self.plant.dv_nominal if self._dv is None else self._dv[min(self.k, len(self._dv) - 1)]
 
     def read(self) -> Sample:
-        """Process variables with their noise, and the MV that was applied."""
-        return Sample(pv=self.pv + self.run.noise[self.k], mv_applied=self.mv, dv=self.dv)
+        """Process variables and measured disturbances with their noise, and the MV that was applied."""
+        run, k = self.run, self.k
+        return Sample(pv=self.pv + run.noise[k], mv_applied=self.mv, dv=self.dv + run.dv_noise[k])
 
     def write(self, mv: Array) -> None:
         """Hold ``mv`` for one period."""

@@ -13,7 +13,7 @@ from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.scenario import Scenario
-from loopwright.pipeline.simulation.simulate import noise_draws
+from loopwright.pipeline.simulation.simulate import DV_DRAW, noise_draws
 from loopwright.serving.manifest import Signal
 
 SETTLE_SAMPLES = 80  # after the last event, where no duration was asked for
@@ -48,6 +48,7 @@ class Timetable:
     mv0: Array  # (n_mv,)
     changes: dict[str, Array]  # plant parameter -> (n,)
     noise: Array  # (n, n_pv)
+    dv_noise: Array  # (n, n_dv) of the readings: the plant feels none of it
     manual: tuple[ManualSpan, ...] = ()
     marks: dict[float, str] = field(default_factory=dict)  # time [s] -> what happened there
     dv: Array | None = None  # (n, n_dv) measured disturbances; None: the plant's own
@@ -158,7 +159,7 @@ def timetable(
                 f"manual from {span.start_s:g} s lies beyond the run, which ends at {n * plant.period_s:g} s"
             )
         marks.setdefault(span.start_s, "manual")
-    return Timetable(plant, sp, x0, mv0, changes, _noise(plant, noise, n, seed), tuple(manual), marks, measured)
+    return Timetable(plant, sp, x0, mv0, changes, *_noise(plant, noise, n, seed), tuple(manual), marks, measured)
 
 
 def _set_point(plant: Simulator, event: Event) -> int:
@@ -236,13 +237,16 @@ def _stretched(values: Array, n: int) -> Array:
     return np.concatenate([values[:n], np.repeat(values[-1:], max(0, n - len(values)), axis=0)])
 
 
-def _noise(plant: Simulator, deviations: Sequence[Event], n: int, seed: int) -> Array:
-    """Measurement noise, shape (n, n_pv), from the standard deviations of some PVs."""
-    std = {s.name: 0.0 for s in plant.pv_signals}
+def _noise(plant: Simulator, deviations: Sequence[Event], n: int, seed: int) -> tuple[Array, Array]:
+    """Measurement noise (n, n_pv) and (n, n_dv), from the standard deviations of some PVs and measured disturbances."""
+    std = {s.name: 0.0 for s in (*plant.pv_signals, *plant.dv_signals)}
     for event in deviations:
         if event.name not in std:
-            raise ParamsError(f"plant {plant.name!r} has no process variable {event.name!r}{nearest(event.name, std)}")
+            what = "process variable or measured disturbance" if plant.dv_signals else "process variable"
+            raise ParamsError(f"plant {plant.name!r} has no {what} {event.name!r}{nearest(event.name, std)}")
         if event.value < 0:
             raise ParamsError(f"the noise of {event.name} is {event.value:g}; a standard deviation is 0 or above")
         std[event.name] = event.value
-    return noise_draws(plant, n, list(std.values()), np.random.default_rng(seed))
+    n_pv, sizes = len(plant.pv_signals), np.array(list(std.values()))
+    white = np.random.default_rng((seed, DV_DRAW)).standard_normal((n, len(plant.dv_signals)))
+    return noise_draws(plant, n, sizes[:n_pv], np.random.default_rng(seed)), sizes[n_pv:] * white

@@ -19,9 +19,8 @@ from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import ParamsError, PipelineError
 from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.evaluation.known import question
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
-from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, turns
+from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, wants_a_plainer_model
 from loopwright.pipeline.files import write_json
 from loopwright.pipeline.models import MODELS, Part, Source
 from loopwright.pipeline.models.part import Groundwork, done, groundworks
@@ -72,15 +71,13 @@ class Fits:
     def proven_if_possible(self, shared: Shared, folder: Path, label: str) -> tuple[Results, dict[str, Any]]:
         """Results and figures; of an own plant with plainer models where the record proves these and no others.
 
-        A network may bend by loads or by what no MV did. The record then refuses it, and a linear model may hold; where
-        the gain turns within the range it would hide that, and none is taken. Where the record contradicts what an
-        engineer says, it would do so with every model.
+        See ``wants_a_plainer_model``. One that misses the plant is not taken either.
         """
         results = self.learnt(shared, folder, label)
         figures = self.figures(results)
         found, plain = {"": {"parts": figures}}, _plainer(shared)
         proofs = self.case.on_models and self.case.stand_in == IDENTIFIED
-        if not proofs or plain is None or question(found) or turns(found) or not sign_doubts(found):
+        if not proofs or plain is None or not wants_a_plainer_model(found):
             return results, figures
         apart = folder / "plainer"
         try:

@@ -21,6 +21,7 @@ from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models import load_model
 from loopwright.pipeline.optimal.model_bounds import SampledHorizon, run_sampled
 from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.simulation.live import SimulatedPlant
 from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
 from loopwright.pipeline.simulation.timetable import Timetable, parse_event, timetable
 from loopwright.serving.controller import Controller
@@ -84,6 +85,20 @@ def test_a_simulation_moves_the_measured_disturbance_that_is_named(case: OwnCase
     for text, said in (("d0=5", "outside"), ("d1=0.1", "no measured disturbance or parameter 'd1'")):
         with pytest.raises(ParamsError, match=said):
             run(text)
+
+
+def test_the_noise_of_a_reading_is_not_felt_by_the_plant(case: OwnCase) -> None:
+    moves, quiet = [parse_event("y0=0.1", "[NAME=]VALUE[@S]")], case.plant.dv_nominal
+    noise = [parse_event("d0=0.3", "PV=STD")]
+    run = timetable(case.plant, set_points=moves, noise=noise, duration_s=2000 * case.plant.period_s, seed=4)
+    simulated = SimulatedPlant(case.plant, run)
+    read = []
+    for _ in range(len(run.sp)):
+        read.append(simulated.read().dv)
+        simulated.write(run.mv0)
+        assert np.array_equal(simulated.dv, quiet)
+    assert np.std(np.array(read) - quiet) == pytest.approx(0.3, rel=0.1)
+    assert not run.noise.any()
 
 
 def test_a_step_that_no_mv_could_balance_is_made_smaller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

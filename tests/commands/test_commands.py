@@ -53,7 +53,7 @@ def test_every_command_tells_what_it_takes(name: str, capsys: pytest.CaptureFixt
         (["inspect", "none.onnx"], "none.onnx: the file cannot be read"),
         (["bench", "none.onnx"], "none.onnx: the file cannot be read"),
         (["conformance", "none.onnx", "kit"], "none.onnx: the file cannot be read"),
-        (["results", "--artifacts", "nowhere"], "nowhere holds no validation.json yet"),
+        (["results", "--artifacts", "nowhere"], "nowhere holds no results"),
         (["laws", "pidd"], "loopwright laws: unknown law 'pidd'; did you mean 'pid'?"),
         (["models", "rbff"], "loopwright models: unknown kind of model 'rbff'; did you mean 'rbf'?"),
         (["bounds", "nowhere"], "loopwright bounds: unknown case 'nowhere'"),

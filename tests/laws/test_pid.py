@@ -249,5 +249,7 @@ def test_the_settings_stand_in_words_as_another_pid_takes_them(signals: Signals)
     assert note.startswith(
         f"{mv.name} by {cv.name}: Kc 0.5 {mv.unit}/({cv.unit}), Ti 40 s, Td 5 s with a filter of 0.5 s"
     )
-    (note,) = PID(signals, PidSettings(0.5, math.inf)).analysis(None).notes
-    assert "no integral part, no derivative" in note
+    assert law.analysis(None).figures == {"kc": 0.5, "ti_s": 40.0, "td_s": 5.0}
+    plain = PID(signals, PidSettings(0.5, math.inf)).analysis(None)
+    assert "no integral part, no derivative" in plain.notes[0]
+    assert plain.figures == {"kc": 0.5, "td_s": 0.0}

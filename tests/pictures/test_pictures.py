@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
+from matplotlib.text import Text
 
 from loopwright.pipeline.cases import CASES, PLANTS
 from loopwright.pipeline.cases.jacketed_batch_reactor.pictures import recipe_picture, switches_picture
@@ -78,6 +79,17 @@ def test_no_legend_covers_a_curve_or_leaves_the_picture(drawn: tuple[Evidence, d
             assert legend_here is None or not points_inside(axes, legend_here.get_window_extent()), name
 
 
+def test_no_title_leaves_the_picture(drawn: tuple[Evidence, dict[str, Canvas]]) -> None:
+    for name, canvas in drawn[1].items():
+        assert titles_end(canvas) <= canvas.bbox.width, name
+
+
+def titles_end(canvas: Canvas) -> float:
+    """Where the rightmost title ends [dots]."""
+    found = [text for axes in canvas.axes for text in axes.findobj(Text) if text.get_text() == axes.get_title("left")]
+    return max((text.get_window_extent().x1 for text in found), default=0.0)
+
+
 def points_inside(axes: Axes, box: Any) -> int:
     """Points of the curves, 50 between each two of the data, that lie in ``box``."""
     count = 0
@@ -128,9 +140,11 @@ def test_the_candidates_of_a_search_have_their_unit_and_plain_ticks() -> None:
         {"lags": "2, 2", "hidden": "6", "parameters": n, "rmse": 1 + n / 1e4, "free_run_rmse": 1 + n / 9e3, "chosen": n}
         for n in (6, 30, 99)
     ]
-    canvas = candidates_picture({"model": "nnarx", "part": "nnarx", "rows": rows, "seeds": 5}, "degC")
+    part = "a part whose name is longer than a picture of that size is wide, as names of tests are, and goes on and on"
+    canvas = candidates_picture({"model": "nnarx", "part": part, "rows": rows, "seeds": 5}, "degC")
     canvas.draw_without_rendering()
     (axes,) = canvas.axes
+    assert titles_end(canvas) <= canvas.bbox.width
     assert axes.get_ylabel() == "validation RMSE [°C]"
     assert not any("10^" in label.get_text() for label in axes.yaxis.get_ticklabels(which="both"))
     for words in axes.texts:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
-from loopwright.pipeline.plants.noise import level_gain, noise_and_change
+from loopwright.pipeline.plants.noise import level_gain, levels, noise_and_change
 
 N = 4000
 
@@ -67,3 +67,37 @@ def test_the_level_follows_as_the_steady_kalman_filter(noise: float, change: flo
 
 def test_a_signal_without_noise_is_its_level() -> None:
     assert level_gain(np.zeros(2), np.array([0.3, 0.0])).tolist() == [1, 1]
+
+
+@given(noise=st.floats(0.1, 3), change=st.floats(0.1, 3), rows=st.integers(2, 12), seed=st.integers(0, 99))
+def test_levels_are_the_likeliest_ones_of_all_rows(noise: float, change: float, rows: int, seed: int) -> None:
+    """Least squares of each reading over the noise and of each change over its own."""
+    seen = np.random.default_rng(seed).normal(size=rows)
+    moves = np.diff(np.eye(rows), axis=0)
+    stacked = np.vstack([np.eye(rows) / noise, moves / change])
+    wanted = np.linalg.lstsq(stacked, np.r_[seen / noise, np.zeros(rows - 1)], rcond=None)[0]
+    found = levels(np.column_stack([seen, seen]), np.array([noise, 0.0]), np.array([change, change]))
+    assert found[:, 0] == pytest.approx(wanted, abs=1e-9)
+    assert found[:, 1].tolist() == seen.tolist()
+
+
+def test_a_single_row_is_its_level() -> None:
+    assert levels(np.array([[3.0]]), np.ones(1), np.ones(1)).tolist() == [[3.0]]
+
+
+@pytest.mark.parametrize("kind", ["walk", "steps"])
+def test_a_plant_has_the_same_gain_to_the_level_as_to_the_signal(kind: str) -> None:
+    """And less to the signal with noise that the plant never felt."""
+    rng = np.random.default_rng(11)
+    clean, _ = signals(rng)[kind]
+    clean = clean - clean.mean()
+    y = np.convolve(clean, [0.0, *(0.4 * 0.6 ** np.arange(40))])[:N]
+    seen = clean + 0.8 * rng.normal(size=N)
+
+    def gain(of: np.ndarray) -> float:
+        past = np.column_stack([of[40 - lag : -lag] for lag in range(1, 40)])
+        return float(np.linalg.lstsq(past, y[40:], rcond=None)[0].sum())
+
+    level = levels(seen[:, None], *noise_and_change([seen[:, None]]))[:, 0]
+    assert gain(clean) == pytest.approx(1)
+    assert abs(gain(level) - 1) < abs(gain(seen) - 1) / 3

@@ -229,7 +229,7 @@ def test_one_case_is_shown_in_all_of_its_tests(artifacts: Path) -> None:
 
 
 def test_what_cannot_be_read_is_one_clear_error(artifacts: Path, tmp_path: Path) -> None:
-    with pytest.raises(PipelineError, match="make run"):
+    with pytest.raises(PipelineError, match="none holds no results"):
         show_results(tmp_path / "none")
     (artifacts / "tank" / "validation.json").write_text('{"scenarios": {}}')
     with pytest.raises(PipelineError, match=r"tank.validation\.json has schema None.*dvc repro"):

@@ -62,6 +62,9 @@ def tell(
         if not all(i.certain for i in report.verdict.inputs if i.role == "mv"):
             print("  end a step where a PV nears an end of its range in the record, and go on with the next one: "
                   "a PV that does not rest by itself, such as a level, would run on")  # fmt: skip
+            for loop in report.operated:
+                print(plain(f"  or leave the loop of {loop.pv} in automatic and step its set point at these times, by "
+                            "what production bears: its rows carry a model too, and nothing runs on"))  # fmt: skip
 
 
 def sayings(verdict: Verdict, units: Mapping[str, str], known: Collection[Known] = ()) -> list[str]:

@@ -16,7 +16,7 @@ from loopwright.pipeline.historian.cleaning.findings import Finding, counted
 from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.outliers_and_units import usual
 from loopwright.pipeline.historian.cleaning.sampling import Sampling
-from loopwright.pipeline.historian.cleaning.tag_checks import PERCENT
+from loopwright.pipeline.historian.cleaning.tag_checks import VALVE_RANGE
 from loopwright.pipeline.historian.cleaning.tags import GUESSED_PAD, KEEP, Tag
 from loopwright.pipeline.historian.files.export import Export, Series
 from loopwright.pipeline.historian.files.rejection_codes import Reason
@@ -213,7 +213,7 @@ def _within_its_range(tag: Tag, values: Array, ends: Sequence[float]) -> bool:
     near = 0.05 * span
     guessed = abs(tag.low - guess[0]) < near and abs(tag.high - guess[1]) < near
     slack = 1e-6 * (tag.high - tag.low)
-    return not (guessed or (tag.unit == "%" and (tag.low, tag.high) == PERCENT)) and all(
+    return not (guessed or (tag.unit == "%" and (tag.low, tag.high) == VALVE_RANGE)) and all(
         tag.low + slack < end < tag.high - slack for end in ends
     )
 

@@ -30,7 +30,7 @@ REPEATED, REPEATED_SHARE = 3, 2e-4  # readings of one value far outside, from wh
 MAINLY = 0.3  # of all values that far
 ABRUPT = 1.5  # of the largest other changes from reading to reading: a change to zero that no plant makes
 LARGEST_CHANGES = 0.999  # quantile: an outlier is no change that the plant makes
-PERCENT = (0.0, 100.0)  # where a manipulated variable in % can stand, if no range is stated
+VALVE_RANGE = (0.0, 100.0)  # where a manipulated variable in % can stand, if no range is stated
 
 
 def sentinels(values: Array, tag: Tag) -> tuple[Where, Counter[str]]:
@@ -96,7 +96,7 @@ def _possible(tag: Tag) -> tuple[float, float]:
         return (-np.inf if tag.low is None else tag.low), (np.inf if tag.high is None else tag.high)
     if tag.role != "mv":
         return np.inf, -np.inf
-    low, high = PERCENT if tag.unit == "%" else (np.inf, -np.inf)
+    low, high = VALVE_RANGE if tag.unit == "%" else (np.inf, -np.inf)
     return (low if tag.low is None else tag.low), (high if tag.high is None else tag.high)
 
 

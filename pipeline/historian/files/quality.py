@@ -42,7 +42,7 @@ CLASSIC = {0, 4, 8, 12, 16, 20, 24, 28, 32, 64, 68, 80, 84, 88, 192, 216}
 """OPC classic: the codes that are defined, without the bits of limits and of the vendor."""
 UA_CODES = 1 << 30
 """OPC UA: bits 31 and 30 are 00 for good, 01 for uncertain, 10 for bad."""
-PERCENT, WHOLE_HEX = 100, 8
+WHOLE_SHARE, WHOLE_HEX = 100, 8
 MOST = 0.75  # of the rows have what is good, where nothing but its number tells it; a state of the plant has less
 MOST_QUALITIES = 1_000  # more are the values of a tag
 MOST_STATES = 20  # numbers of a column of states; more are readings
@@ -116,8 +116,8 @@ def _of_figures(column: str, figures: Mapping[str, int], counts: Mapping[str, in
     wide = any((m := HEX.search(t.strip().lower())) and len(m[1]) == WHOLE_HEX for t in figures)
     if max(known) >= UA_CODES or (wide and not classic):
         return {t for t, v in values.items() if v >> 30 == 0}, "OPC UA status codes, of which 0 is good"
-    whole = {t for t, v in values.items() if v == PERCENT}
-    if max(known) == PERCENT and (known <= {0, PERCENT} or 2 * _times(whole, counts) > total):
+    whole = {t for t, v in values.items() if v == WHOLE_SHARE}
+    if max(known) == WHOLE_SHARE and (known <= {0, WHOLE_SHARE} or 2 * _times(whole, counts) > total):
         return whole, "percent, of which 100 is good"
     if classic and (_are_codes(known) or _times(classic, counts) >= MOST * total):
         return classic, ""
@@ -203,5 +203,5 @@ def is_quality(column: str, counts: Mapping[str, int], *, beside: bool) -> bool:
     ):
         return True
     if not beside:
-        return is_sure(column) and known <= {0, 1, PERCENT}
+        return is_sure(column) and known <= {0, 1, WHOLE_SHARE}
     return word != "q" and len(known) <= MOST_STATES and meaning_of(column, counts).good is not None

@@ -22,7 +22,7 @@ from loopwright.pipeline.plants.simulator import Simulator
 
 @dataclass(frozen=True, slots=True)
 class NnarxParams(AdaptiveParams):
-    """Those of an adaptive PID, and how much the model believes the measurement.
+    """Parameters of an adaptive PID, and how much the model believes the measurement.
 
     ``offset_filter`` alpha and ``trust``, both in (0, 1], as in ``NextOutput``; 1 is as the paper.
     """

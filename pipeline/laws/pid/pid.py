@@ -239,21 +239,29 @@ class PID(ControlLaw):
         if self.pairings:
             return self._pairing()
         if self.examined_cv is None:
-            return Analysis(notes=self._in_words())
+            return Analysis(self._figures(), notes=self._in_words())
         known = equations(plant, "law 'pid' with `examined_cv`")
         loops = FrozenLoops.of(known, self, self.n_state, np.linspace(*self.examined_cv, EXAMINED))
         radius = spectral_radius(loops.matrices())
-        figures = {"frozen_radius": float(radius.max()), "gain_margin": loops.gain_margin()}
+        figures = self._figures() | {"frozen_radius": float(radius.max()), "gain_margin": loops.gain_margin()}
         return Analysis(figures, {"frozen_cv": loops.cv, "frozen_radius": radius}, self._in_words())
 
     def _pairing(self) -> Analysis:
         cvs, (chosen, *others) = self.signals.sp, self.pairings
         gains = zip(chosen.pairs, chosen.relative_gains, strict=True)
-        figures = {f"relative_gain_{cvs[i].name}": gain for (i, _), gain in gains}
+        figures = self._figures() | {f"relative_gain_{cvs[i].name}": gain for (i, _), gain in gains}
         return Analysis(
             figures,
             notes=(*self._in_words(), *choice_words(chosen, others, cvs, self.signals.mv, given=self.pairs_given)),
         )
+
+    def _figures(self) -> dict[str, float]:
+        """Kc [MV/CV], Ti [s] and Td [s] of the loop, or of each by its MV; without an integral part there is no Ti."""
+        found: dict[str, float] = {}
+        for (_, j), s in zip(self.pairs, self.loops, strict=True):
+            of = f"_{self.signals.mv[j].name}" if len(self.pairs) > 1 else ""
+            found |= {f"kc{of}": s.kc} | ({f"ti_s{of}": s.ti_s} if isfinite(s.ti_s) else {}) | {f"td_s{of}": s.td_s}
+        return found
 
     def _in_words(self) -> tuple[str, ...]:
         """The settings of each loop, as somebody types them into another PID."""

@@ -155,10 +155,11 @@ def tuned(
 
 def in_words(tried: Sequence[Candidate]) -> str:
     """The numbers that a search tried, its start first, and its gain, for the report."""
-    first, last = tried[0].cost, min(c.cost for c in tried)
+    first, least, taken = tried[0].cost, min(c.cost for c in tried), calmest(tried).cost
+    costs = f"{first:.3g} with the first numbers, {least:.3g} at the least and {taken:.3g} with those taken"
     return (
         f"{len(tried)} sets of numbers were tried in closed loops over the model with errors of gain, pace and dead "
-        f"time, with loads and noise; the cost fell from {first:.3g} to {last:.3g}. It is the mean of the errors at "
+        f"time, with loads and noise; the cost is {costs}. It is the mean of the errors at "
         "set points and under loads, each over that with the first numbers, .05 for a travel of 1 % of the MVs' range "
         f"a sample, and a little for numbers far from the first. Of those within {100 * CALM:.0f} % of the least "
         "cost without travel, those of the least travel are taken; a higher `speed` moves more and errs less, as the "

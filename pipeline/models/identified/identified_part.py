@@ -44,7 +44,6 @@ from loopwright.pipeline.models.identified.verdict import (
     structure_figures,
 )
 from loopwright.pipeline.models.part import Learnt, Part, Source
-from loopwright.pipeline.plants.noise import noise_and_change
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.levels import levels_of, only_between
 from loopwright.pipeline.records.record import Record
@@ -160,8 +159,7 @@ class IdentifiedPart(Part):
         compared = any(least < most for least, most in selection.dead_times)
         dead = np.array([_later(selection, n_mv)]) if compared else doubt.dead
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": dead}
-        dv_noise, dv_change = noise_and_change([rows.v[i:j, n_mv:] for i, j in rows.bounds()])
-        disturbances = {"dv_noise": dv_noise, "dv_change": dv_change}
+        disturbances = {"dv_noise": searched.dv_noise, "dv_change": searched.dv_change}
         loads = {"load_moves": _load_moves(fitted.model, whole)}
         known = {"noise": noise, "colour": colour, **loads, **disturbances, **open_to}
         model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
@@ -200,7 +198,7 @@ class IdentifiedPart(Part):
             "warnings": warnings,
             "disturbances": {
                 s.name: {"noise_sd": float(sd)}
-                for s, sd in zip(source.signals.dv, dv_noise * scales.v_scale[n_mv:], strict=True)
+                for s, sd in zip(source.signals.dv, searched.dv_noise * scales.v_scale[n_mv:], strict=True)
             },
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
             "step_responses": response_figures(curves, structure.delays, rows, scales, pvs, inputs),

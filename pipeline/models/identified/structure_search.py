@@ -22,10 +22,12 @@ from loopwright.pipeline.models.identified.scaled_record import (
     folds,
     informative,
     may_act_in_its_row,
+    noise_of_disturbances,
 )
 from loopwright.pipeline.models.identified.steady_states import INTEGRATES
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Trial, best_of
 from loopwright.pipeline.models.part import Groundwork, Source
+from loopwright.pipeline.plants.simulator import Array
 
 SETTLES = 0.98
 """Slowest pole of a fold up to which it speaks for a plant that settles, where another one integrates."""
@@ -247,11 +249,16 @@ MORE = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Searched:
-    """The problem that was searched, its outcome, the scales of its record, and what is known beside that record."""
+    """The problem that was searched, its outcome, the scales of its record, and what is known beside that record.
+
+    ``dv_noise`` and ``dv_change`` (n_dv,) are of its measured disturbances, scaled.
+    """
 
     problem: Problem
     selection: Selection
     scales: Scales
+    dv_noise: Array
+    dv_change: Array
     known: Sequence[Beside] = ()
 
 
@@ -275,7 +282,8 @@ class StructureSearch(Groundwork[Searched]):
         back = seen.fed_back or fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
         record = informative(seen, MORE * self.rows if back else self.rows)
         scales = Scales.of(record, n_y)
-        data = ScaledRecord.of(record, scales)
+        dv_noise, dv_change = noise_of_disturbances(ScaledRecord.of(seen, scales), n_mv)
+        data = ScaledRecord.of(record, scales).followed(dv_noise, dv_change)
         signals = source.signals
         inputs, outputs = [s.name for s in (*signals.mv, *signals.dv)], [s.name for s in signals.pv[:n_y]]
         # No model is bent to what the record is certain to contradict: that is asked, and answered by a person.
@@ -288,9 +296,8 @@ class StructureSearch(Groundwork[Searched]):
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
         selection = select(rounds, orders=orders, units=self.units, correction=self.correction, lagged=self.lagged)
-        return Searched(
-            replace(problem, settles=selection.settles, farthest=selection.farthest), selection, scales, beside
-        )
+        problem = replace(problem, settles=selection.settles, farthest=selection.farthest)
+        return Searched(problem, selection, scales, dv_noise, dv_change, beside)
 
     def plainer(self, found: Searched) -> Searched | None:
         """The linear model in the network's place: it may be proven where the network bends by what is not the MVs'."""

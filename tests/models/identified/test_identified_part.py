@@ -77,6 +77,13 @@ def test_noise_of_a_measured_disturbance_is_found() -> None:
     assert float(model.dv_change * model.v_scale[2:]) == pytest.approx(np.diff(record.dv, axis=0).std(), rel=0.15)
 
 
+def test_noise_of_a_measured_disturbance_makes_no_gain_too_small() -> None:
+    record, signals = made_plants.two_by_two(2000, measured=True), made_plants.signals_of(2, 2, 1)
+    noisy = replace(record, dv=record.dv + np.random.default_rng(2).normal(size=record.dv.shape))
+    gains = LINEAR.learn(Source(noisy, signals)).metrics["gains"]
+    assert [gains[y]["d0"]["gain"] for y in ("y0", "y1")] == pytest.approx([2.0, -1.0], rel=0.015)
+
+
 def test_a_second_process_variable_is_an_output_where_all_measured_ones_are() -> None:
     record, signals = made_plants.two_by_two(600), made_plants.signals_of(2, 2)
     source = Source(record, replace(signals, sp=signals.pv[:1]))
