@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import resource
@@ -11,9 +10,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from closed_plant import ClosedPlant
@@ -22,20 +20,7 @@ from loops import Steps
 from plant import OwnPlant
 from torch import Tensor
 
-from loopwright.pipeline.commands import new
-from loopwright.pipeline.commands.own_plant.from_export import asked, given_tags
-from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, wants_a_plainer_model
-from loopwright.pipeline.historian.cleaning.tags import named
-from loopwright.pipeline.historian.export_params import screened_export, with_units
-from loopwright.pipeline.historian.guessing import controlled_first
-from loopwright.pipeline.historian.screening import refusal
-from loopwright.pipeline.laws import LAWS
-from loopwright.pipeline.models.identified.identified import Identified
-from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
-from loopwright.pipeline.models.identified.structure_search import Searched
-from loopwright.pipeline.models.part import Source
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.workbench import PlantData, design, identify, screen
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import OutputError
 
@@ -96,72 +81,28 @@ def paced(plant: OwnPlant, law: Steps, period_s: float) -> Steps:
     return law if abs(periods - 1) < 1e-6 else Paced(law, periods)
 
 
-@dataclass(frozen=True, slots=True)
-class Read:
-    """A file as `loopwright new` reads it: the record, and why it is not used, empty where it is.
-
-    ``held``: PV -> the sign by which its old loop held it, of a plant of one loop.
-    """
-
-    record: Record
-    signals: Signals
-    refused: str
-    verdict: str
-    held: dict[str, int]
-
-
-def read(file: Path, options: Sequence[str]) -> Read:
+def read(file: Path, options: Sequence[str]) -> PlantData:
     """``file`` as `loopwright new NAME FILE` with these options; RecordError where there is no record at all."""
-    parser = argparse.ArgumentParser()
-    new.options(parser)
-    given = parser.parse_args(["plant", str(file), *options])
-    tags, _ = given_tags(given)
-    export = asked(given, tags)
-    tags = with_units(controlled_first(named(tags)), export)
-    found = screened_export(export, tags)
-    record, why = found.record, refusal(found, tags, anyway=False)
-    n = min(len(record.pv_signals), len(record.mv_signals))
-    signals = Signals(record.period_s, record.pv_signals[:n], record.pv_signals, record.dv_signals, record.mv_signals)
-    believed = [law for law in found.report.old_controllers if law.believed]
-    held = {law.pv: 1 if law.kc > 0 else -1 for law in believed} if n == 1 else {}
-    return Read(record, signals, "" if why is None else why.why, found.report.verdict.carries, held)
+    given: dict[str, list[str]] = {}
+    for option, words in zip(options[::2], options[1::2], strict=True):
+        given.setdefault(option.removeprefix("--"), []).append(words)
+    return screen(file, **given)
 
 
-def fitted(found: Read, minutes: float | None = None) -> tuple[Identified, str]:
-    """The model of a record as stage `fit` makes it with all defaults, and what its proof holds against it.
-
-    The linear model takes the place of a network that the record does not prove, as there. ``minutes`` is the budget
-    of the search; None: the default.
-    """
-    part, source = IdentifiedPart(minutes=minutes), Source(found.record, found.signals, held=found.held)
-    work = part.groundwork()
-    searched = work.done(source, work.kind)
-    model, metrics = _learnt(part, source, searched)
-    doubts, plain = sign_doubts(metrics), work.plainer(searched)
-    if plain is None or not wants_a_plainer_model(metrics):
-        return model, doubts
-    other, metrics = _learnt(part, source, plain)
-    return (model, doubts) if sign_doubts(metrics) or fit_doubts(metrics) else (other, "")
-
-
-def _learnt(part: IdentifiedPart, source: Source, searched: Searched) -> tuple[Identified, dict[str, Any]]:
-    """The model of a search, and the figures of its set as those who judge the proof read them."""
-    learnt = part.learn(replace(source, groundwork={part.groundwork(): searched}))
-    assert isinstance(learnt.model, Identified)
-    parts = {"identified": {"kind": "identified", "per_seed": {"0": learnt.metrics}}}
-    return learnt.model, {"": {"parts": parts}}
+def verdict(found: PlantData) -> str:
+    """Whether the readings can carry a model."""
+    assert found.screened is not None
+    return found.screened.report.verdict.carries
 
 
 def by_fit(plant: ClosedPlant, file: Path) -> Delivered:
     """The predictive law on a model of the record: no tests, no gates; what they would have said is told."""
     began = time.process_time()
     found = read(file, roles(plant))
-    said = [f"new: {found.verdict}{f', refused: {found.refused}' if found.refused else ''}"]
-    model, doubts = fitted(found)
-    said += [f"proof: {doubts or 'holds'}"]
-    predictive = LAWS["predictive"]
-    law = predictive.design(predictive.Params(tuning="search"), {"identified": model}, found.signals, None).eval()
-    law = paced(plant, law, found.signals.period_s)
+    said = [f"new: {verdict(found)}{f', refused: {found.refused}' if found.refused else ''}"]
+    fit = identify(found)
+    said += [f"proof: {fit.doubts or 'holds'}"]
+    law = paced(plant, design("predictive", fit), found.signals.period_s)
     return Delivered({"predictive": law}, said, time.process_time() - began)
 
 

@@ -18,13 +18,15 @@ import numpy as np
 from closed_benchmark import kept, product_digest, yardstick_of
 from closed_development import CLOSED_DEVELOPMENT
 from closed_plant import ClosedPlant
-from closed_product import fitted, read
+from closed_product import read
+from closed_product import verdict as carries
 from closed_record import ClosedRecord, closed_record_of, recorded, roles, write_export
 from numpy.typing import NDArray
 from store import FOLDER
 
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.workbench import identify
 
 ROWS = 4_000
 MINUTES = 0.3  # of the search: the proof looks at answers, which are there early
@@ -79,11 +81,11 @@ def verdict(plant: ClosedPlant, record: ClosedRecord, folder: Path, minutes: flo
         found = read(file, roles(plant))
         if found.refused:
             return {"by": "new", "why": found.refused, "seconds": time.process_time() - began}
-        _, doubts = fitted(found, minutes)
+        doubts = identify(found, minutes=minutes).doubts
     except PipelineError as error:
         return {"by": "error", "why": str(error), "seconds": time.process_time() - began}
     by = "proof" if doubts else "slips"
-    return {"by": by, "why": doubts or f"new said {found.verdict}", "seconds": time.process_time() - began}
+    return {"by": by, "why": doubts or f"new said {carries(found)}", "seconds": time.process_time() - began}
 
 
 def refused_main(kinds: Sequence[str], count: int, minutes: float) -> int:

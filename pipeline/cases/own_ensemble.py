@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -12,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from loopwright.pipeline.cases.operating_range import Reach, visited_mv
-from loopwright.pipeline.cases.own_model import Doubts, OwnPlant, doubted, suits
+from loopwright.pipeline.cases.own_model import MODEL_ARRAYS, Doubts, OwnPlant, doubted, suits
 from loopwright.pipeline.config.exports import is_exported
 from loopwright.pipeline.errors import ModelError, PlantError, RecordError
 from loopwright.pipeline.evaluation.case import Array, Case
@@ -20,8 +19,6 @@ from loopwright.pipeline.evaluation.evidence_basis import RecordVerdict
 from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
 from loopwright.pipeline.evaluation.one_side import before_turns, on_one_side
 from loopwright.pipeline.files import read_json
-from loopwright.pipeline.plants.identified import IdentifiedArrays
-from loopwright.pipeline.plants.noise import deviation
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
@@ -94,17 +91,11 @@ class OwnEnsemble(Case):
         """A model over the ranges of these signals; ModelError for a damaged file."""
         try:
             with np.load(path, allow_pickle=False) as file:
-                arrays = IdentifiedArrays(**{field.name: file[field.name] for field in fields(IdentifiedArrays)})
-                colour, doubts = np.asarray(file["colour"]), Doubts.of(file)
-                noise = deviation(file["noise"] * file["y_scale"], colour)
-                dv_noise = file["dv_noise"] * file["v_scale"][len(signals.mv) :]
+                found = {name: file[name] for name in MODEL_ARRAYS}
         except (OSError, ValueError, KeyError, EOFError, BadZipFile):
             raise ModelError(f"{path} is damaged, or no identified model; remove it, and run its fit stage") from None
         dv = np.median(self.record.dv, axis=0)
-        most = int(np.ceil(max(doubts.dead, self._doubts.dead)))
-        plant = OwnPlant(signals, arrays, name=self.name, mv=mv, dv=dv, most_dead_time=most)
-        plant.noise, plant.dv_noise, plant.colour, plant.doubts = noise, dv_noise, colour, doubts
-        return plant
+        return OwnPlant.of_model(found, signals, name=self.name, mv=mv, dv=dv, dead=self._doubts.dead)
 
     @cached_property
     def _doubts(self) -> Doubts:

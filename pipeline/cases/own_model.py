@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Self
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
-from loopwright.pipeline.plants.identified import IdentifiedPlant, longest_memory
+from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant, longest_memory
+from loopwright.pipeline.plants.noise import deviation
 from loopwright.pipeline.plants.perturbed import SpoiltPlant, likely_error
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Array, Simulator
@@ -18,6 +20,11 @@ from loopwright.pipeline.plants.simulator import Array, Simulator
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
 LEAST_GAIN, LEAST_PACE, LEAST_DEAD = 0.25, 0.25, 1.0
 MOST_GAIN, MOST_PACE, MOST_DEAD = 1.0, 0.8, 5.0  # twice the gain; beyond that a record tells nothing worth a test
+
+MODEL_ARRAYS = (
+    *(field.name for field in fields(IdentifiedArrays)),
+    *("noise", "colour", "dv_noise", "gain_sd", "pace_sd", "dead_sd"),
+)
 
 VISITED = 2.0  # standard deviations of an output in the record
 
@@ -56,6 +63,23 @@ class OwnPlant(IdentifiedPlant):
     colour: Array
     doubts: Doubts
     rest: tuple[Array, Array] | None = None
+
+    @classmethod
+    def of_model(
+        cls, found: Mapping[str, Array], signals: Signals, *, name: str, mv: Array, dv: Array, dead: float = 0.0
+    ) -> Self:
+        """The plant of an identified model's arrays, begun at MVs (n_mv,) under measured disturbances (n_dv,).
+
+        It may be later than the model by ``dead`` periods, or by the dead times that its record leaves open.
+        """
+        doubts = Doubts.of(found)
+        arrays = IdentifiedArrays(**{field.name: found[field.name] for field in fields(IdentifiedArrays)})
+        most = int(np.ceil(max(doubts.dead, dead)))
+        plant = cls(signals, arrays, name=name, mv=mv, dv=dv, most_dead_time=most)
+        plant.noise = deviation(found["noise"] * found["y_scale"], found["colour"])
+        plant.dv_noise = found["dv_noise"] * found["v_scale"][len(signals.mv) :]
+        plant.colour, plant.doubts = found["colour"], doubts
+        return plant
 
     @property
     def foreseen(self) -> int:

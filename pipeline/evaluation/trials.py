@@ -19,6 +19,7 @@ from loopwright.pipeline.evaluation.knowing_control import reached
 from loopwright.pipeline.evaluation.law_evidence import BASE, Cycle
 from loopwright.pipeline.evaluation.metric import mean_of_draws, together
 from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from loopwright.pipeline.simulation.simulate import DV_DRAW, Trajectory, noise_of_disturbances, simulate_closed
 from loopwright.serving.controller import Controller
@@ -125,7 +126,9 @@ class Repeated:
 def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, seed: int) -> Repeated:
     """One test; with noise it runs ``noise_draws`` times."""
     draws = range(case.noise_draws if noise else 1)
-    loops = [close_loop(controller, case, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws]
+    loops = [
+        close_loop(controller, case.plant, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws
+    ]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
     found = [seized(case, test, loop) for loop in loops]
     swing = sum(swings_on(case, test, loop) for loop in loops)
@@ -140,12 +143,13 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     )
 
 
-def close_loop(controller: Controller, case: Case, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
-    """One closed loop; an extra entry of info is 1 if the controller refused the step.
+def close_loop(controller: Controller, plant: Simulator, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
+    """One closed loop over the test's plant, or over ``plant`` where it has none.
 
-    The MV then stays at its last value, as in the real loop's HOLD. With noise, measured disturbances have theirs.
+    An extra entry of info is 1 if the controller refused the step. The MV then stays at its last value, as in the real
+    loop's HOLD. With noise, measured disturbances have theirs.
     """
-    plant, state = test.plant or case.plant, controller.cold_state()
+    plant, state = test.plant or plant, controller.cold_state()
     disturbances = test.disturbances(plant)
     if noise is not None:
         disturbances = disturbances + noise_of_disturbances(plant, test.samples, np.random.default_rng([seed, DV_DRAW]))

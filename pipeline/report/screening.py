@@ -1,16 +1,21 @@
-"""The page of a screening: one HTML file with its pictures inside."""
+"""A screening for a person: lines on the plant by its data, and a page, one HTML file with its pictures inside."""
 
 from __future__ import annotations
 
 import base64
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from matplotlib.figure import Figure as Canvas
 
+from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.files import write_text
+from loopwright.pipeline.historian.cleaning.findings import InputReport, Verdict
+from loopwright.pipeline.historian.excitation import HELD
 from loopwright.pipeline.historian.files.rejection_codes import Reason
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.historian.step_test import StepTest
+from loopwright.pipeline.pictures.drawing import axis_label, ratio_unit
 from loopwright.pipeline.pictures.excitation_pictures import inputs, verdict
 from loopwright.pipeline.pictures.png import png
 from loopwright.pipeline.pictures.screening_pictures import details, readings, times_of, trends
@@ -47,3 +52,51 @@ def write_page(path: Path, found: Screened, test: StepTest | None) -> None:
 
 def _inline(canvas: Canvas) -> str:
     return "data:image/png;base64," + base64.b64encode(png(canvas)).decode()
+
+
+# ------------------------------------------------------------------------------ lines on the plant by its data
+def sayings(verdict: Verdict, units: Mapping[str, str], known: Collection[Known] = ()) -> list[str]:
+    """Lines on the plant by its data, one a pair, for a person to compare with what is known of it.
+
+    ``units`` are those of the signals by name; of the pairs that are ``known`` nothing is asked.
+    """
+    lines, said = [], {(one.pv, one.input): one.says for one in known}
+    for i in verdict.inputs:
+        for pv, gain in i.gain.items():
+            first = i.first_answer_s.get(pv)
+            rate = i.rate.get(pv)
+            if not gain and first is None and rate is None:
+                open_question = "does it move it on the plant, and which way?"
+                if i.role == "mv":
+                    further = f"you say {said[pv, i.name]}" if (pv, i.name) in said else open_question
+                    lines.append(f"{i.name} -> {pv}: not clear from the record; {further}")
+                continue
+            # The report has the gain at the middle of the record, by the models that are fitted later.
+            by_one = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
+            words = [by_one if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
+            hidden = f"or settles slowly: {i.name} follows {pv}, which hides the difference"
+            words += [hidden] if rate is not None and not gain and pv in i.against else []
+            seldom = ", as it seldom rests" * (i.held_share < HELD)
+            words += [f"first answer not seen{seldom}" if first is None else _after(first, i.first_possible_s[pv])]
+            words += [_settles(i, pv)] if gain else []
+            words += ["gain and settling unreliable: drift or loads"] if gain and pv in verdict.unsure else []
+            lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
+    return lines
+
+
+def _settles(report: InputReport, pv: str) -> str:
+    """How long the slowest PV takes to settle, where that is certain."""
+    return f"the slowest settles in {report.settling_s:g} s" if pv in report.certain else "settling time not certain"
+
+
+def _ramp(rate: float, top: str, bottom: str) -> str:
+    """Change of a PV that integrates, in a minute, with its unit and that of the input."""
+    per = f"per {axis_label('', bottom).strip() or 'unit'}"
+    return f"integrates: {axis_label(f'{rate:.3g}', top)} {per} and minute"
+
+
+def _after(first_s: float, possible_s: float) -> str:
+    """When a PV answers first, as a range where the noise hides how early."""
+    if possible_s <= 0 < first_s:
+        return f"first answer after {first_s:g} s at most"
+    return f"first answer after {f'{possible_s:g} to ' if possible_s < first_s else ''}{first_s:g} s"

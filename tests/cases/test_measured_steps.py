@@ -158,7 +158,7 @@ class Noted:
 def test_a_controller_is_given_each_sample_of_the_disturbance(case: OwnCase) -> None:
     for name in (MEASURED, "load"):
         test, controller = case.tests()[name][0], Noted()
-        close_loop(cast(Controller, controller), case, test, None, 0)
+        close_loop(cast(Controller, controller), case.plant, test, None, 0)
         assert test.plant is not None
         wanted = np.tile(test.plant.dv_nominal, (test.samples, 1)) if test.dv is None else test.dv
         np.testing.assert_array_equal(np.array(controller.given), wanted)

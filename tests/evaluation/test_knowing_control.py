@@ -88,21 +88,21 @@ def test_a_hold_beyond_reach_is_no_lock_up_and_is_counted() -> None:
     case = controllers_of_a_lag({})
     controller: Any = AtEnd(1.0)
     full = a_test(case, [1.9, 1.9, -1.9], time_constant=100.0)
-    loop = close_loop(controller, case, full, None, 0)
+    loop = close_loop(controller, case.plant, full, None, 0)
     assert seized(case, full, loop) == (False, 3)
     found = repeated(controller, case, full, False, 0)
     assert (found.lock_ups, found.beyond_reach) == (0, 3)
     quick = a_test(case, [1.9, -1.9])  # the other way the plant would get there
-    assert seized(case, quick, close_loop(controller, case, quick, None, 0)) == (True, 0)
+    assert seized(case, quick, close_loop(controller, case.plant, quick, None, 0)) == (True, 0)
     both = a_test(case, [2.5, -1.9])
-    assert seized(case, both, close_loop(controller, case, both, None, 0)) == (True, 1)
+    assert seized(case, both, close_loop(controller, case.plant, both, None, 0)) == (True, 1)
 
 
 def test_where_tests_run_on_equations_every_such_hold_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     case = controllers_of_a_lag({})
     monkeypatch.setattr(type(case), "on_models", False)
     full = a_test(case, [1.9], time_constant=100.0)
-    loop = close_loop(AtEnd(1.0), case, full, None, 0)  # type: ignore[arg-type]
+    loop = close_loop(AtEnd(1.0), case.plant, full, None, 0)  # type: ignore[arg-type]
     assert seized(case, full, loop)[0]
 
 

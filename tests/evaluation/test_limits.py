@@ -69,7 +69,7 @@ def test_a_loop_that_leaves_its_limits_counts_on_every_model(level: OwnCase, law
 def test_the_swinging_loop_is_no_lock_up(level: OwnCase) -> None:
     """Without the check of the limits it would be shipped."""
     test = level.tests()["held_out"][0]
-    loop = close_loop(cast(Controller, Told(swinging)), level, test, None, 0)
+    loop = close_loop(cast(Controller, Told(swinging)), level.plant, test, None, 0)
     assert not locked_up(loop.sp, loop.pv, loop.mv, test.hold, low=[-1.0], high=[1.0], span=[6.0])
     assert np.abs(loop.pv).max() > 3 + LEFT * 6
     assert seized(level, test, loop)[0]

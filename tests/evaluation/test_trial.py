@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -55,7 +54,7 @@ def test_noisy_figures_are_means_over_different_noise(case: Case) -> None:
     test = case.scenarios()["trajectory"][0]
     controller: Any = Proportional()
     found = repeated(controller, case, test, True, 7)
-    loops = [close_loop(controller, case, test, case.noise_std, 7 + DRAW * i) for i in range(case.noise_draws)]
+    loops = [close_loop(controller, case.plant, test, case.noise_std, 7 + DRAW * i) for i in range(case.noise_draws)]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
     assert len({row["sse"] for row in rows}) == case.noise_draws
     assert found.metrics["sse"] == pytest.approx(np.mean([row["sse"] for row in rows]), rel=1e-12)
@@ -67,7 +66,7 @@ def test_noisy_figures_are_means_over_different_noise(case: Case) -> None:
 def test_figures_of_a_test_with_a_late_part_count_it(case: Case) -> None:
     test = case.scenarios()["trajectory"][0]
     controller: Any = Proportional()
-    loop = close_loop(controller, case, test, None, 0)
+    loop = close_loop(controller, case.plant, test, None, 0)
     error = (loop.sp - loop.pv)[:, 0]
     found = case.score(test, loop.pv, loop.mv)
     assert found["sse_late"] == pytest.approx(float(np.sum(error[test.late_from :] ** 2)))
@@ -78,7 +77,7 @@ def test_a_law_gets_the_nominal_measured_disturbances(case: Case, monkeypatch: p
     test, controller = case.scenarios()["trajectory"][0], Proportional()
     monkeypatch.setattr(type(case.plant), "dv_nominal", np.array([295.0]))
     monkeypatch.setattr(type(case.plant), "stepper", lambda self: lambda x, mv, dv, p: x)
-    close_loop(controller, case, test, None, 0)  # type: ignore[arg-type]
+    close_loop(controller, case.plant, test, None, 0)  # type: ignore[arg-type]
     assert len(controller.dv) == test.samples
     assert {tuple(dv) for dv in controller.dv} == {(295.0,)}
 
@@ -86,21 +85,21 @@ def test_a_law_gets_the_nominal_measured_disturbances(case: Case, monkeypatch: p
 def test_a_refused_step_keeps_the_mv_and_counts_as_a_lock_up(case: Case) -> None:
     test = case.scenarios()["trajectory"][0]
     held: Any = Proportional(refused=13)
-    loop = close_loop(held, case, test, None, 0)
+    loop = close_loop(held, case.plant, test, None, 0)
     assert loop.mv[12] == loop.mv[11]
     assert loop.info[:, -1].tolist() == [float(k == 12) for k in range(test.samples)]
     assert loop.info[13, 1] == 0  # it started afresh
     assert seized(case, test, loop)[0]
     sound: Any = Proportional()
-    assert not seized(case, test, close_loop(sound, case, test, None, 0))[0]
+    assert not seized(case, test, close_loop(sound, case.plant, test, None, 0))[0]
 
 
 def test_a_loop_at_its_limit_is_locked_up_and_a_start_up_is_not(case: Case) -> None:
     test = case.scenarios()["trajectory"][0]
     cold: Any = Proportional(gain=-1.0)  # the wrong way: full cooling for ever
-    assert seized(case, test, close_loop(cold, case, test, None, 0))[0]
+    assert seized(case, test, close_loop(cold, case.plant, test, None, 0))[0]
     hard: Any = Proportional(gain=1.0)  # full heating for 8 samples, then near the profile
-    loop = close_loop(hard, case, test, None, 0)
+    loop = close_loop(hard, case.plant, test, None, 0)
     assert (loop.mv[:7] == 1).all()
     assert not seized(case, test, loop)[0]
 
@@ -108,7 +107,7 @@ def test_a_loop_at_its_limit_is_locked_up_and_a_start_up_is_not(case: Case) -> N
 def test_a_loop_that_swings_to_the_end_is_no_lock_up_and_is_told(case: Case) -> None:
     test = case.scenarios()["trajectory"][0]
     sound: Any = Proportional()
-    loop = close_loop(sound, case, test, None, 0)
+    loop = close_loop(sound, case.plant, test, None, 0)
     assert not swings_on(case, test, loop)
     pv, cv = loop.pv.copy(), case.plant.sp_signals[0]
     pv[:, 0] = cv.middle + 0.02 * (cv.high - cv.low) * np.cos(np.pi * np.arange(len(pv)))
@@ -195,7 +194,7 @@ def test_measured_disturbances_have_their_own_noise_where_the_test_has_noise() -
     def course(sd: float, noise: Any) -> tuple[np.ndarray, Any]:
         plant, controller = Fed(sd), Proportional(gain=0.0)
         test = Scenario("rest", "Rest", np.full((400, 1), 5.0), *plant.start, dv=np.full((400, 1), 2.0))
-        loop = close_loop(controller, SimpleNamespace(plant=plant), test, noise, 3)  # type: ignore[arg-type]
+        loop = close_loop(controller, plant, test, noise, 3)  # type: ignore[arg-type]
         return np.array(controller.dv), loop
 
     noise = np.array([0.1])

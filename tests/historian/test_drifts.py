@@ -9,10 +9,10 @@ import pytest
 from dirty_plant import PERIOD_S, Clean, clean, screen_of
 from scipy.signal import lfilter
 
-from loopwright.pipeline.commands.own_plant.printed import sayings
 from loopwright.pipeline.historian.cleaning.findings import InputReport
 from loopwright.pipeline.historian.drift import Jump, jump_of, levels_of
 from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.report.screening import sayings
 
 N = 4000
 ALONG = np.linspace(0.0, 1.0, N)

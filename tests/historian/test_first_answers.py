@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from dirty_plant import PERIOD_S, Clean, clean, screen_of, steps
 
-from loopwright.pipeline.commands.own_plant.printed import sayings
 from loopwright.pipeline.historian.answers import first_answer
 from loopwright.pipeline.historian.cleaning.findings import Verdict
+from loopwright.pipeline.report.screening import sayings
 
 N, DEAD, FIRST = 4000, 3, 4  # u(k-3) acts on y(k+1)
 

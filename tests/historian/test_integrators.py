@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from dirty_plant import Clean, screen_of, steps
 
-from loopwright.pipeline.commands.own_plant.printed import sayings
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.screening import Screened
+from loopwright.pipeline.report.screening import sayings
 
 RATE = 0.02  # a row, of the level by the valve
 PERIOD_S = 10.0

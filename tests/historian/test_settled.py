@@ -10,7 +10,6 @@ import pytest
 from dirty_plant import PERIOD_S, START_S, Clean, clean, screen_of
 from scipy.signal import lfilter
 
-from loopwright.pipeline.commands.own_plant.printed import sayings
 from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.historian import settling
 from loopwright.pipeline.historian.cleaning.findings import Finding, InputReport
@@ -26,6 +25,7 @@ from loopwright.pipeline.historian.step_test import (
     load_sd,
     planned,
 )
+from loopwright.pipeline.report.screening import sayings
 
 LOAD_SD, LAG, DEAD = 4.0, 20, 7
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 
 from loopwright.pipeline.config.known import Known
-from loopwright.pipeline.historian.cleaning.findings import InputReport, Screening, Verdict, counted
-from loopwright.pipeline.historian.excitation import HELD
+from loopwright.pipeline.historian.cleaning.findings import Screening, counted
 from loopwright.pipeline.historian.settling import in_words
 from loopwright.pipeline.historian.step_test import StepTest
-from loopwright.pipeline.pictures.drawing import axis_label, ratio_unit
+from loopwright.pipeline.pictures.drawing import axis_label
+from loopwright.pipeline.report.screening import sayings
 from loopwright.serving.words import plain
 
 
@@ -65,50 +65,3 @@ def tell(
             for loop in report.operated:
                 print(plain(f"  or leave the loop of {loop.pv} in automatic and step its set point at these times, by "
                             "what production bears: its rows carry a model too, and nothing runs on"))  # fmt: skip
-
-
-def sayings(verdict: Verdict, units: Mapping[str, str], known: Collection[Known] = ()) -> list[str]:
-    """Lines on the plant by its data, one a pair, for a person to compare with what is known of it.
-
-    ``units`` are those of the signals by name; of the pairs that are ``known`` nothing is asked.
-    """
-    lines, said = [], {(one.pv, one.input): one.says for one in known}
-    for i in verdict.inputs:
-        for pv, gain in i.gain.items():
-            first = i.first_answer_s.get(pv)
-            rate = i.rate.get(pv)
-            if not gain and first is None and rate is None:
-                open_question = "does it move it on the plant, and which way?"
-                if i.role == "mv":
-                    further = f"you say {said[pv, i.name]}" if (pv, i.name) in said else open_question
-                    lines.append(f"{i.name} -> {pv}: not clear from the record; {further}")
-                continue
-            # The report has the gain at the middle of the record, by the models that are fitted later.
-            by_one = axis_label(f"gain {gain:.3g}", ratio_unit(units.get(pv, ""), i.unit)) + " by one linear model"
-            words = [by_one if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
-            hidden = f"or settles slowly: {i.name} follows {pv}, which hides the difference"
-            words += [hidden] if rate is not None and not gain and pv in i.against else []
-            seldom = ", as it seldom rests" * (i.held_share < HELD)
-            words += [f"first answer not seen{seldom}" if first is None else _after(first, i.first_possible_s[pv])]
-            words += [_settles(i, pv)] if gain else []
-            words += ["gain and settling unreliable: drift or loads"] if gain and pv in verdict.unsure else []
-            lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
-    return lines
-
-
-def _settles(report: InputReport, pv: str) -> str:
-    """How long the slowest PV takes to settle, where that is certain."""
-    return f"the slowest settles in {report.settling_s:g} s" if pv in report.certain else "settling time not certain"
-
-
-def _ramp(rate: float, top: str, bottom: str) -> str:
-    """Change of a PV that integrates, in a minute, with its unit and that of the input."""
-    per = f"per {axis_label('', bottom).strip() or 'unit'}"
-    return f"integrates: {axis_label(f'{rate:.3g}', top)} {per} and minute"
-
-
-def _after(first_s: float, possible_s: float) -> str:
-    """When a PV answers first, as a range where the noise hides how early."""
-    if possible_s <= 0 < first_s:
-        return f"first answer after {first_s:g} s at most"
-    return f"first answer after {f'{possible_s:g} to ' if possible_s < first_s else ''}{first_s:g} s"
