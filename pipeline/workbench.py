@@ -46,6 +46,8 @@ from loopwright.pipeline.models.identified.network_search import UNITS
 from loopwright.pipeline.models.identified.structure_search import Searched
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.pictures.loop_picture import History, draw
+from loopwright.pipeline.pictures.png import png
+from loopwright.pipeline.pictures.screening_pictures import trends
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
@@ -86,6 +88,10 @@ class PlantData:
         old = [*(loop.words for loop in report.operated), *(law.words for law in report.old_controllers)]
         carries = f"can these data carry a model: {report.verdict.carries}"
         return "\n".join([report.summary, *findings, *said, *old, carries, *report.verdict.reasons])
+
+    def _repr_png_(self) -> bytes | None:
+        """The trends, as a notebook shows them below a cell that ends with this record."""
+        return None if self.screened is None else png(trends(self.screened))
 
     def page(self, path: str | Path) -> None:
         """Write the page of the screening: trends with every reading that was left out, and why."""
@@ -311,6 +317,12 @@ class Run:
         columns |= {f"measured {s.name}": v for s, v in zip(plant.pv_signals, loop.measured.T, strict=True)}
         columns |= {s.name: v for s, v in zip(plant.mv_signals, loop.mv.T, strict=True)}
         return pd.DataFrame(columns, index=pd.Index(loop.time_s, name="time_s"))
+
+    def _repr_png_(self) -> bytes:
+        """The picture, as a notebook shows it below a cell that ends with this run."""
+        with tempfile.TemporaryDirectory() as folder:
+            self.draw(path := Path(folder) / "run.png")
+            return path.read_bytes()
 
     def draw(self, path: str | Path) -> None:
         """Write a picture of the loop."""

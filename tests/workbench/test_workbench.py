@@ -63,6 +63,7 @@ def test_readings_become_a_record(data: PlantData, tmp_path: Path) -> None:
     assert (len(data.record), data.record.period_s, data.refused) == (ROWS, PERIOD_S, "")
     assert [s.name for s in (*data.signals.pv, *data.signals.mv, *data.signals.dv)] == ["TI.PV", "TI.OP", "FI.PV"]
     assert f"{ROWS} rows" in str(data)
+    assert (data._repr_png_() or b"").startswith(b"\x89PNG")
     data.page(tmp_path / "page.html")
     assert "<html" in (tmp_path / "page.html").read_text()
 
@@ -91,7 +92,7 @@ def test_a_file_closes_the_loop_over_the_model(found: Identification, controller
     assert run.mae["TI.PV"] < 0.5
     assert 0 < run.travel["TI.OP"] < 80
     run.draw(tmp_path / "loop.png")
-    assert (tmp_path / "loop.png").stat().st_size > 10_000
+    assert (tmp_path / "loop.png").read_bytes() == run._repr_png_()
     noisy = simulate(controller.path, found.plant, {0: 50.0}, noise=True, duration_s=600).frame()
     assert (noisy["measured TI.PV"] - noisy["TI.PV"]).std() == pytest.approx(0.1, rel=0.4)
 
