@@ -99,7 +99,8 @@ def test_a_file_closes_the_loop_over_the_model(found: Identification, controller
 
 def test_a_plant_in_equations_needs_no_model(tmp_path: Path) -> None:
     plant = ThiosulfateCstr()
-    run = simulate(export(design("pid", plant=plant, tuning="imc"), tmp_path / "pid.onnx"), plant, {0: 0.5, 60: 0.6}, duration_s=400)
+    controller = export(design("pid", plant=plant, tuning="imc"), tmp_path / "pid.onnx")
+    run = simulate(controller, plant, {0: 0.5, 60: 0.6}, duration_s=400)
     assert run.frame().iloc[-1, 1] == pytest.approx(0.6, abs=0.01)
     data = experiment(plant, rows=300)
     assert len(data.record) == 300
