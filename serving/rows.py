@@ -29,16 +29,10 @@ class ControllerRows:
 
     def __init__(self, controller: Controller, n: int) -> None:
         self.controller, self.n = controller, n
-        c = controller
-        base = c._in.ctypes.data
-        self._given = np.zeros((n, len(c._in)))
-        self._taken = np.zeros((n, len(c._out)))
-        self._places = {
-            name: slice((part.ctypes.data - base) // 8, (part.ctypes.data - base) // 8 + shape[0])
-            for _, name, part, shape in c._inputs
-        }
-        self._low = np.array([s.low for s in c.manifest.mv])
-        self._high = np.array([s.high for s in c.manifest.mv])
+        places = controller.places
+        self._mv, self._next = places.pop("mv"), places.pop("state_next")
+        self._places = places
+        self._given = np.zeros((n, controller.width))
 
     def cold_state(self) -> Array:
         """States of zeros, shape (n, n_state): no past."""
@@ -48,32 +42,23 @@ class ControllerRows:
         """One step of each row; all inputs (n, ...), in engineering units. An input that the law has not is ignored.
 
         Raises ContractError for an input of another shape. A row with an input that is not finite, or whose output is
-        not finite or outside the MV's range, is marked as refused.
+        not finite, outside the MV's range or further from ``mv_applied`` than the MV moves in a period, is marked as
+        refused.
         """
-        c, given = self.controller, {"sp": sp, "pv": pv, "dv": dv, "mv_applied": mv_applied, "state": state}
+        given = {"sp": sp, "pv": pv, "dv": dv, "mv_applied": mv_applied, "state": state}
         for name, place in self._places.items():
             wanted = (self.n, place.stop - place.start)
             if given[name].shape != wanted:
                 raise ContractError(f"{name} has the shape {given[name].shape}; {self.n} rows need {wanted}")
             self._given[:, place] = given[name]
-        fit: NDArray[np.bool_] = np.all(np.isfinite(self._given), axis=1)
-        with c._lock:
-            run, binding, buffer, result = c._session.run_with_iobinding, c._binding, c._in, c._out
-            for row, out, good in zip(self._given, self._taken, fit.tolist(), strict=True):
-                if not good:
-                    continue
-                buffer[:] = row
-                try:
-                    run(binding)
-                except Exception:
-                    out[:] = np.nan
-                    continue
-                out[:] = result
-        n_mv, a, b, *_ = c._cuts
-        mv = self._taken[:, :n_mv].copy()
-        allowed: NDArray[np.bool_] = np.all((mv >= self._low) & (mv <= self._high), axis=1)
-        for i, signal in enumerate(c.manifest.mv):
+        taken = self.controller.compute(self._given)
+        mv = taken[:, self._mv].copy()
+        allowed: NDArray[np.bool_] = np.all(np.isfinite(taken), axis=1)
+        for signal, moved, applied in zip(self.controller.manifest.mv, mv.T, mv_applied.T, strict=True):
+            allowed &= (moved >= signal.low) & (moved <= signal.high)
             if signal.values is not None:
-                allowed &= np.isin(mv[:, i], signal.values)
-        allowed &= fit & np.all(np.isfinite(self._taken), axis=1)
-        return StepRows(mv, self._taken[:, a:b].copy(), np.logical_not(allowed))
+                allowed &= np.isin(moved, signal.values)
+            if signal.most < np.inf:
+                pairs = zip(applied.tolist(), moved.tolist(), strict=True)
+                allowed &= np.array([signal.moves(before, after) for before, after in pairs])
+        return StepRows(mv, taken[:, self._next].copy(), np.logical_not(allowed))

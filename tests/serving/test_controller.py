@@ -33,6 +33,7 @@ from loopwright.serving.controller_file import TRAILER_BYTES, seal
 from loopwright.serving.errors import OutputError
 from loopwright.serving.graph.audit import audit
 from loopwright.serving.manifest import MANIFEST_KEY
+from loopwright.serving.rows import ControllerRows
 
 pytest_plugins = ["small_laws"]
 FEED: dict[str, Any] = {"sp": 1.0, "pv": [0.8, 300.0], "mv_applied": [40.0], "state": [1.0, 0.1]}
@@ -581,6 +582,27 @@ def test_an_output_further_from_the_applied_mv_than_it_moves_a_period_is_refused
         return
     with pytest.raises(OutputError, match="at most 5 % a period"):
         slow.step(**feed)
+
+
+def test_rows_are_steps_bit_for_bit_and_refused_as_they_are(
+    pi_file: Path, controller: Controller, tmp_path: Path
+) -> None:
+    slow, rng, n = Controller(slow_file(pi_file, controller, tmp_path)), np.random.default_rng(2), 200
+    pv = np.column_stack([rng.uniform(-8, 8, n), np.full(n, 300.0)])
+    pv[::17, 0] = np.nan
+    given = {"sp": np.ones((n, 1)), "pv": pv, "mv_applied": rng.uniform(-1, 101, (n, 1)), "state": np.zeros((n, 2))}
+    rows = ControllerRows(slow, n).step(**given, dv=np.zeros((n, 0)))
+    refused = 0
+    for k in range(n):
+        try:
+            one = slow.step(**{name: values[k] for name, values in given.items()})
+        except (SampleError, OutputError):
+            assert rows.refused[k]
+            refused += 1
+            continue
+        assert not rows.refused[k]
+        assert (one.mv.tolist(), one.state.tolist()) == (rows.mv[k].tolist(), rows.state[k].tolist())
+    assert 20 < refused < n - 20
 
 
 def test_rounding_refuses_no_move() -> None:
