@@ -29,11 +29,12 @@ from loopwright.pipeline.commands.own_plant.replaced import (
 )
 from loopwright.pipeline.config.entries import add_entries
 from loopwright.pipeline.config.exports import ExportParams
+from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.config.params import sections
 from loopwright.pipeline.config.plants import check_name
 from loopwright.pipeline.errors import PipelineError, RecordError
 from loopwright.pipeline.files import draft_folder_of, write_json, write_text
-from loopwright.pipeline.historian.answers import beside_record
+from loopwright.pipeline.historian.answers import Beside, beside_record
 from loopwright.pipeline.historian.cleaning.record_rows import evenly
 from loopwright.pipeline.historian.cleaning.tags import RANGES, ROLES, TableError, Tag, limited, named
 from loopwright.pipeline.historian.export_params import screened_export, with_units
@@ -183,7 +184,7 @@ def _write(
     signals = signals_as_tags(found.record, tags)
     said = stated_of(signals, options.known)
     known, more = known_kept(name, said, signals) if options.replace else (said.known, [])
-    questions = [beside.question for beside in beside_record(known, found.record) if beside.question]
+    questions = [beside.question for beside in _beside(known, found.record) if beside.question]
     unusable, lost = refusal(found, tags, options.anyway), list[str]()
     if unusable and folder.exists() and (name in sections("plants") or not _refused(folder)):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
@@ -245,6 +246,15 @@ def _write(
     if unusable:
         print(f"loopwright new: {name} was not added to params.yaml: {_words(unusable)}", file=sys.stderr)
     return 2 if unusable else 0
+
+
+def _beside(known: Sequence[Known], record: Record) -> list[Beside]:
+    """Each statement beside the record, as stage `fit` holds them against each other."""
+    if not known:
+        return []
+    from loopwright.pipeline.models.identified.measured_disturbances import with_levels  # torch takes seconds to load
+
+    return beside_record(known, with_levels(record, record.pv.shape[1]))
 
 
 def _refused(folder: Path) -> bool:

@@ -35,8 +35,11 @@ class StateEquation:
 
     def advance(self, x: Array, v: Array) -> Array:
         """The next states (..., n_x) of scaled states (..., n_x) under scaled inputs (..., n_v)."""
+        linear = x @ self.a.T + v @ self.b.T + self.c
+        if not len(self.b1):
+            return linear
         z = np.concatenate([x, v], axis=-1)
-        return x @ self.a.T + v @ self.b.T + self.c + np.tanh(z @ self.w1.T + self.b1) @ self.w2.T
+        return linear + np.tanh(z @ self.w1.T + self.b1) @ self.w2.T
 
     def slope(self, x: Array, v: Array) -> Array:
         """dx+/dx (n_x, n_x) at one state x (n_x,) under v (n_v,)."""

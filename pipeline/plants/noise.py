@@ -11,6 +11,7 @@ from loopwright.pipeline.plants.simulator import Array
 
 CERTAIN = 3.0  # standard errors by which the changes of a signal turn back before that is called noise
 LEAST_ROWS = 20  # of a stretch
+LEAST_CHANGE = 1e-3  # of the noise: a level that never moved would be wrong for good
 
 
 def deviation(white: Array, colour: Array) -> Array:
@@ -41,8 +42,8 @@ def noise_and_change(stretches: Sequence[Array]) -> tuple[Array, Array]:
 
     with the differences D from row to row. Noise makes each change turn back in the next one; so does all of the
     signal's own motion that is gone a row later, which nobody can act on. A change by no more than ``CERTAIN`` standard
-    errors is none, and has no noise. The signal's own change is no less than one standard error, for the record leaves
-    so much open: a level that never moved would be wrong for good. Stretches shorter than ``LEAST_ROWS`` say nothing.
+    errors is none, and has no noise. The signal's own change is no less than one standard error or ``LEAST_CHANGE`` of
+    the noise, for the record leaves so much open. Stretches shorter than ``LEAST_ROWS`` say nothing.
     """
     width = stretches[0].shape[1] if stretches else 0
     changes = [np.diff(s, axis=0) for s in stretches if len(s) >= LEAST_ROWS]
@@ -54,7 +55,8 @@ def noise_and_change(stretches: Sequence[Array]) -> tuple[Array, Array]:
     noise, error = turned.mean(axis=0), turned.std(axis=0) / roots
     noise = np.where(noise > CERTAIN * error, np.minimum(noise, own.mean(axis=0) / 2), 0.0)
     left = own - 2 * np.where(noise > 0, turned, 0.0)
-    return np.sqrt(noise), np.sqrt(np.maximum(own.mean(axis=0) - 2 * noise, left.std(axis=0) / roots))
+    least = np.maximum(left.std(axis=0) / roots, LEAST_CHANGE**2 * noise)
+    return np.sqrt(noise), np.sqrt(np.maximum(own.mean(axis=0) - 2 * noise, least))
 
 
 def level_gain(noise: Array, change: Array) -> Array:
@@ -70,15 +72,26 @@ def level_gain(noise: Array, change: Array) -> Array:
     return np.where(noise > 0, root / (root + 2), 1.0)
 
 
+def running_levels(signals: Array, noise: Array, change: Array) -> Array:
+    """Levels d (rows, n) of signals (rows, n) as ``level_gain`` follows them row by row, from the first reading on."""
+    from scipy.signal import lfilter  # half a second to load
+
+    found = signals.copy()
+    for j in np.flatnonzero(noise > 0):
+        gain = float(level_gain(noise, change)[j])
+        found[:, j] = lfilter([gain], [1.0, gain - 1.0], signals[:, j], zi=[(1.0 - gain) * signals[0, j]])[0]
+    return found
+
+
 def levels(signals: Array, noise: Array, change: Array) -> Array:
     """Levels d (rows, n) of signals s (rows, n), from all rows before and after each: a record's, not a running loop's.
 
         min over d:   sum (s(k) - d(k))^2 / noise^2 + sum (d(k) - d(k-1))^2 / change^2
 
-    The fixed-interval smoother of the filter of ``level_gain``. The part of the signal that it misses goes
-    with none of the levels, so that a plant has the gain to d that it has to the signal without noise. s itself holds
-    noise that the plant never felt, which makes gains too small (Carroll et al., Measurement Error in Nonlinear Models,
-    2006, ch. 4). Without noise d = s.
+    The fixed-interval smoother of the filter of ``level_gain``. Of a random walk in white noise the part
+    of the signal that it misses goes with none of the levels, so that a plant has the gain to d that it has to the
+    signal without noise; of others nearly so. s itself holds noise that the plant never felt, which makes gains too
+    small (Carroll et al., Measurement Error in Nonlinear Models, 2006, ch. 4). Without noise d = s.
     """
     found = signals.copy()
     for j in np.flatnonzero(noise > 0):

@@ -7,7 +7,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
-import numpy as np
 import pytest
 
 from loopwright.pipeline.models.identified.structure_search import Searched, Selection, StructureSearch
@@ -93,7 +92,7 @@ def test_a_network_that_is_refused_leaves_the_choice_to_the_linear_model() -> No
     trials: Any = [SimpleNamespace(against=frozenset(), error=error) for error in (1.0, 0.5)]
     found = Selection(*trials, [], 0.0, settles=True, drifts=False, innovations=50.0)
     search = StructureSearch("identified", False, None, True, (4,), None, None, 8000)
-    plain = search.plainer(Searched(None, found, None, np.zeros(0), np.zeros(0)))  # type: ignore[arg-type]
+    plain = search.plainer(Searched(None, found, None, None))  # type: ignore[arg-type]
     assert plain is not None
     assert (found.chosen, plain.selection.chosen) == (trials[1], trials[0])
     assert search.plainer(plain) is None

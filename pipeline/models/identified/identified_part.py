@@ -144,7 +144,8 @@ class IdentifiedPart(Part):
         bands, weights = [*fits, *drawn_ones], np.r_[weights, np.ones(len(drawn_ones))]
         # The gains belong to the middle of the whole record, also where only a part of its rows is fitted.
         record = source.data(self.model.kind)
-        rows, names = ScaledRecord.of(record, scales), [s.name for s in pvs]
+        measured = searched.disturbances
+        rows, names = measured.smoothed(ScaledRecord.of(record, scales)), [s.name for s in pvs]
         runs, predictions = free_run_figures(problem, selection.chosen, scales, names)
         curves = response_curves(bands, rows)
         cells = Cells.of(bands, rows, n_mv, curves.shape[2]) if structure.n_hidden else None
@@ -159,7 +160,7 @@ class IdentifiedPart(Part):
         compared = any(least < most for least, most in selection.dead_times)
         dead = np.array([_later(selection, n_mv)]) if compared else doubt.dead
         open_to = {"gain_sd": doubt.gain, "pace_sd": doubt.pace, "dead_sd": dead}
-        disturbances = {"dv_noise": searched.dv_noise, "dv_change": searched.dv_change}
+        disturbances = {"dv_noise": measured.noise, "dv_change": measured.change}
         loads = {"load_moves": _load_moves(fitted.model, whole)}
         known = {"noise": noise, "colour": colour, **loads, **disturbances, **open_to}
         model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
@@ -198,7 +199,7 @@ class IdentifiedPart(Part):
             "warnings": warnings,
             "disturbances": {
                 s.name: {"noise_sd": float(sd)}
-                for s, sd in zip(source.signals.dv, searched.dv_noise * scales.v_scale[n_mv:], strict=True)
+                for s, sd in zip(source.signals.dv, measured.noise * scales.v_scale[n_mv:], strict=True)
             },
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
             "step_responses": response_figures(curves, structure.delays, rows, scales, pvs, inputs),

@@ -259,6 +259,7 @@ def foreseen(problem: Problem, chosen: Trial, names: Sequence[str], y_scale: Arr
     is that of the model with its noise, ``rows`` their number, and ``nats`` the log-likelihood that the inputs gain.
     Where the MVs move by the PVs alone, or by nothing that has to do with them, they gain none.
     """
+    problem = problem.in_a_loop
     parts, n_y = [], problem.data.y.shape[1]
     for k, fold in enumerate(problem.folds):
         rows = problem.part(chosen.structure, slice(None))

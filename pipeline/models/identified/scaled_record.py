@@ -14,7 +14,6 @@ from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.identified.dynamics import Stretch
 from loopwright.pipeline.models.training.objectives import check_finite
 from loopwright.pipeline.models.training.regressors import split_in_time
-from loopwright.pipeline.plants.noise import levels, noise_and_change
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 
@@ -100,15 +99,6 @@ class ScaledRecord:
         """Some neighbouring rows."""
         return replace(self, y=self.y[rows], v=self.v[rows], run=self.run[rows])
 
-    def followed(self, noise: Array, change: Array) -> Self:
-        """The same rows with the levels of the measured disturbances, whose noise and own change (n_dv,) are given."""
-        if not noise.any():
-            return self
-        v, n_mv = self.v.copy(), self.v.shape[1] - len(noise)
-        for first, last in self.bounds():
-            v[first:last, n_mv:] = levels(v[first:last, n_mv:], noise, change)
-        return replace(self, v=v)
-
     def stretches(self) -> list[Stretch]:
         """The runs that are long enough; ModelError where none is."""
         found = [Stretch(self.y[i:j], self.v[i:j]) for i, j in self.bounds() if j - i >= SHORTEST]
@@ -156,18 +146,9 @@ def informative(record: Record, most: int, block: int = 500) -> Record:
     return replace(record, run=np.cumsum(cut, dtype=np.int64) - 1, **taken)
 
 
-# ------------------------------------------------- what the past explains: by which row an MV acts, and what is noise
+# ------------------------------------------------------- the row on whose outputs an MV acts: the next one, or its own
 LAGS = 12
 """Lags of the ARX whose innovations are looked at."""
-
-LATEST = 60
-"""Most rows by which the answer to a measured disturbance is late."""
-
-PACES = (0.0, 0.6, 0.9)
-"""Poles of the lags by which outputs answer to a measured disturbance; more of them rebuild a signal from its level."""
-
-BY_CHANCE = 1.0
-"""Nats by which a signal may explain the outputs better than its level, and still be noisy."""
 
 AFTER = 10
 """Rows after an innovation in which a controller's reaction to it would show."""
@@ -196,47 +177,6 @@ def may_act_in_its_row(data: ScaledRecord, n_mv: int) -> bool:
     unexplained = _residual(np.column_stack([past, mv[rows]]), data.y[rows])
     moves = np.diff(mv, axis=0, prepend=mv[:1])
     return not any(np.any(_correlations(moves[rows + j], unexplained) > bound) for j in range(1, AFTER + 1))
-
-
-def noise_of_disturbances(data: ScaledRecord, n_mv: int) -> tuple[Array, Array]:
-    """Standard deviations (n_dv,) of the measured disturbances' noise and of their own change, scaled.
-
-    What turns back a row later is noise, or a quick motion of the disturbance itself. The outputs tell the two apart:
-    an ARX explains more of them by the levels where it is noise, and by the signal as it is where the plant feels it.
-    """
-    n_dv = data.v.shape[1] - n_mv
-    noise, change = noise_and_change([data.v[i:j, n_mv:] for i, j in data.bounds()])
-    for j in np.flatnonzero(noise > 0).tolist():
-        alone = np.where(np.arange(n_dv) == j, noise, 0.0)
-        as_it_is, as_level = (_unexplained(of, n_mv + j) for of in (data, data.followed(alone, change)))
-        if as_it_is + BY_CHANCE < as_level:
-            moves = np.concatenate([np.diff(data.v[i:k, n_mv + j]) for i, k in data.bounds()])
-            change[j], noise[j] = np.sqrt((moves**2).mean()), 0.0
-    return noise, change
-
-
-def _unexplained(data: ScaledRecord, j: int) -> float:
-    """Nats n/2 sum log(power) of the residuals (n, n_y) of an ARX with lags of input j, of the best dead time.
-
-    Infinite where rows are too few.
-    """
-    from scipy.signal import lfilter  # half a second to load
-
-    first = LAGS + LATEST
-    rows = np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(i + first, k) for i, k in data.bounds())])
-    z = np.delete(np.hstack([data.y, data.v]), data.y.shape[1] + j, axis=1)
-    past = np.column_stack([*(z[rows - lag] for lag in range(1, LAGS + 1)), np.ones(len(rows))])
-    if len(rows) < 3 * past.shape[1]:
-        return np.inf
-    runs = [data.v[i:k, j] for i, k in data.bounds()]
-    answers = np.vstack([np.column_stack([lfilter([1.0], [1.0, -p], v) for p in PACES]) for v in runs])
-    late = np.hstack([answers[rows - lag] for lag in range(LATEST + 1)])
-    left = _residual(past, np.hstack([data.y[rows], late]))
-    y, late = left[:, : data.y.shape[1]], left[:, data.y.shape[1] :]
-    powers = [
-        (_residual(late[:, d : d + len(PACES)], y) ** 2).mean(axis=0) for d in range(0, late.shape[1], len(PACES))
-    ]
-    return len(rows) / 2 * min(float(np.log(np.maximum(power, 1e-300)).sum()) for power in powers)
 
 
 def _residual(columns: Array, values: Array) -> Array:

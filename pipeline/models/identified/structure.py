@@ -59,6 +59,7 @@ class Problem:
     that the plant comes to rest by itself, as its linear model does; a network that does not is rejected, and so is one
     with rests beyond ``farthest``, scaled. ``fed_back``
     says that the MVs follow the outputs. ``known`` is what an engineer knows of pairs of output and input.
+    ``seen`` are the rows as a running loop sees them, where those of ``data`` know of later readings.
     """
 
     data: ScaledRecord
@@ -70,11 +71,17 @@ class Problem:
     farthest: float = FARTHEST
     fed_back: bool = False
     known: Knowledge = NOTHING_KNOWN
+    seen: ScaledRecord | None = None
 
     def part(self, structure: Structure, rows: slice) -> ScaledRecord:
         """Some rows, the inputs shifted to where they act in this structure, those at 0 that are known not to act."""
         shift = [d - int(structure.same_row and j < self.n_mv) for j, d in enumerate(structure.delays)]
         return self.known.heard(self.data.delayed(shift).rows(rows))
+
+    @property
+    def in_a_loop(self) -> Problem:
+        """The same over the rows that a running loop sees: no figure of a model may rest on later readings."""
+        return self if self.seen is None else replace(self, data=self.seen, seen=None)
 
     def train(self, structure: Structure, fold: int) -> list[Stretch]:
         """Training stretches of a fold."""

@@ -12,6 +12,7 @@ from loopwright.pipeline.historian.feedback import fed_back
 from loopwright.pipeline.models.identified.candidates import RESTS, misses, rests_under
 from loopwright.pipeline.models.identified.knowledge import Knowledge
 from loopwright.pipeline.models.identified.linear_search import LinearSearch, smallest_first
+from loopwright.pipeline.models.identified.measured_disturbances import Disturbances
 from loopwright.pipeline.models.identified.network_search import NetworkSearch
 from loopwright.pipeline.models.identified.noise_search import NATS, NETWORK_NATS, NoiseSearch, likely_dead_times, nats
 from loopwright.pipeline.models.identified.residual_tests import Drift, curved, drift_of
@@ -22,12 +23,10 @@ from loopwright.pipeline.models.identified.scaled_record import (
     folds,
     informative,
     may_act_in_its_row,
-    noise_of_disturbances,
 )
 from loopwright.pipeline.models.identified.steady_states import INTEGRATES
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Trial, best_of
 from loopwright.pipeline.models.part import Groundwork, Source
-from loopwright.pipeline.plants.simulator import Array
 
 SETTLES = 0.98
 """Slowest pole of a fold up to which it speaks for a plant that settles, where another one integrates."""
@@ -251,14 +250,13 @@ MORE = 3
 class Searched:
     """The problem that was searched, its outcome, the scales of its record, and what is known beside that record.
 
-    ``dv_noise`` and ``dv_change`` (n_dv,) are of its measured disturbances, scaled.
+    ``disturbances`` is of those that are measured.
     """
 
     problem: Problem
     selection: Selection
     scales: Scales
-    dv_noise: Array
-    dv_change: Array
+    disturbances: Disturbances
     known: Sequence[Beside] = ()
 
 
@@ -282,22 +280,26 @@ class StructureSearch(Groundwork[Searched]):
         back = seen.fed_back or fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
         record = informative(seen, MORE * self.rows if back else self.rows)
         scales = Scales.of(record, n_y)
-        dv_noise, dv_change = noise_of_disturbances(ScaledRecord.of(seen, scales), n_mv)
-        data = ScaledRecord.of(record, scales).followed(dv_noise, dv_change)
+        data = ScaledRecord.of(record, scales)
+        disturbances = Disturbances.of(ScaledRecord.of(seen, scales), data, n_mv)
+        data, in_a_loop = disturbances.smoothed(data), disturbances.followed(data)
         signals = source.signals
         inputs, outputs = [s.name for s in (*signals.mv, *signals.dv)], [s.name for s in signals.pv[:n_y]]
         # No model is bent to what the record is certain to contradict: that is asked, and answered by a person.
-        beside = beside_record(source.known, record)
+        dv = data.v[:, n_mv:] * scales.v_scale[n_mv:] + scales.v_center[n_mv:]
+        beside = beside_record(source.known, replace(record, dv=dv) if disturbances.sure.any() else record)
         used = [one.known for one in beside if not one.question]
         known = Knowledge.of(used, outputs, inputs, scales, signals.period_s)
-        problem = Problem(data, folds(record), n_mv, source.seed, self.correction or 0.0, fed_back=back, known=known)
+        problem = Problem(
+            data, folds(record), n_mv, source.seed, self.correction or 0.0, fed_back=back, known=known, seen=in_a_loop
+        )
         budget = Budget(60 * (MINUTES * n_y if self.minutes is None else self.minutes), len(data), n_y)
         least, most = self.orders or (max(2, n_y), 8 + 2 * (n_y - 1))
         orders = range(max(least, n_y), max(most, n_y) + 1)
         rounds = Rounds(problem, budget, label)
         selection = select(rounds, orders=orders, units=self.units, correction=self.correction, lagged=self.lagged)
         problem = replace(problem, settles=selection.settles, farthest=selection.farthest)
-        return Searched(problem, selection, scales, dv_noise, dv_change, beside)
+        return Searched(problem, selection, scales, disturbances, beside)
 
     def plainer(self, found: Searched) -> Searched | None:
         """The linear model in the network's place: it may be proven where the network bends by what is not the MVs'."""

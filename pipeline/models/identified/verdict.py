@@ -111,7 +111,7 @@ def free_run_figures(
     PV was low, in the middle and high, and ``outside_training``: the share of these rows in which it left the range of
     the training rows, where the error says nothing of the other rows.
     """
-    best = trial.of_fold(fold)[0]
+    best, problem = trial.of_fold(fold)[0], problem.in_a_loop
     held = problem.held(trial.structure, fold)
     pairs = _ahead(best.model, held) if isinstance(best.model, Innovations) else _free(problem, best.model, held)
     actual, predicted = (np.concatenate(of) * scales.y_scale + scales.y_center for of in zip(*pairs, strict=True))
