@@ -297,7 +297,7 @@ def test_nothing_that_a_loop_gives_raises_and_its_memory_is_bounded() -> None:
     ]
     for k in range(500):
         monitor.observe(3_000.0 + k, *strange[rng.integers(len(strange))])
-    loop(monitor, 10_000, seed=1, began=3_500)
+    loop(monitor, 20_000, seed=1, began=3_500)
     text = json.dumps(monitor.state(), allow_nan=False)
     assert len(text) < 3 * size
     for verdict in monitor.verdicts():
@@ -330,7 +330,7 @@ def test_a_monitor_that_starts_again_goes_on_where_it_was() -> None:
     # A restart is a gap: what follows has nothing to do with what was.
     one._gap()
     for monitor in (one, other):
-        loop(monitor, 5_000, seed=1, began=9_000)
+        loop(monitor, 9_000, seed=1, began=9_000)
     assert other.numbers() == pytest.approx(one.numbers(), rel=1e-3)
     assert [v.level for v in one.verdicts()] == [v.level for v in other.verdicts()]
 
