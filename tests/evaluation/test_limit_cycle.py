@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,11 +19,12 @@ from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
 PERIOD = 8  # samples of a swing
 
 
-@pytest.fixture
-def case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> OwnCase:
+@pytest.fixture(scope="module")
+def case(tmp_path_factory: pytest.TempPathFactory) -> Iterator[OwnCase]:
     """A lag whose set points go over about 1.5 m of a range of 6 m, with little noise."""
-    monkeypatch.chdir(tmp_path)
-    return controllers_of_a_lag({}, noise=1e-4)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("lag"))
+        yield controllers_of_a_lag({}, noise=1e-4)
 
 
 def resting(case: OwnCase) -> Trajectory:

@@ -453,7 +453,7 @@ def test_a_law_with_a_level_is_exported(tmp_path: Path) -> None:
     model = random_model(3, n_dv=2)
     model.dv_noise.copy_(torch.tensor([0.0, 0.1]))
     model.dv_change.copy_(torch.tensor([0.1, 0.05]))
-    law, path = law_of(model), tmp_path / "law.onnx"
+    law, path = law_of(model, horizon=8, moves=2, passes=1, sweeps=2), tmp_path / "law.onnx"
     assert law.kept["level"] == 2
     assert law.follow[0] == 1
     assert law.follow[1] < 1

@@ -61,7 +61,7 @@ def test_params_yaml_takes_one_number_or_one_for_each_mv(law: type[PID | Predict
 
 def test_a_file_keeps_the_limit_of_one_mv_and_says_it(tmp_path: Path) -> None:
     signals = slow(0.05, None)
-    law = Predictive(signals, random_model(2, n_y=2, n_mv=2), Predictive.Params(horizon=8, moves=2)).eval()
+    law = Predictive(signals, random_model(2, n_y=2, n_mv=2), Predictive.Params(horizon=8, moves=2, passes=1)).eval()
     assert law.rate is not None
     assert torch.equal(law.rate, torch.tensor([0.05, inf], dtype=torch.float64))
     manifest = export(law, tmp_path / "law.onnx", case="made", provenance={})

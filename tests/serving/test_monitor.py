@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Callable
@@ -271,6 +272,14 @@ def loop(monitor: Monitor, n: int, seed: int, began: int = 0) -> None:
         monitor.observe(float(k), Sample(np.array([pv]), np.array([sp])), command(k, sp=sp, mv=sp + 0.1 * rng.normal()))
 
 
+@cache
+def learned() -> Monitor:
+    """A monitor whose charts have learnt; for a test that gives it more, a copy."""
+    monitor = Monitor(manifest(), started_s=0.0)
+    loop(monitor, 9_000, seed=0)
+    return monitor
+
+
 def test_nothing_that_a_loop_gives_raises_and_its_memory_is_bounded() -> None:
     monitor = Monitor(manifest(), started_s=0.0)
     loop(monitor, 3_000, seed=0)
@@ -316,8 +325,7 @@ def test_a_loop_that_has_held_for_a_while_is_not_judged_by_its_first_scans() -> 
 
 
 def test_a_monitor_that_starts_again_goes_on_where_it_was() -> None:
-    one = Monitor(manifest(), started_s=0.0)
-    loop(one, 9_000, seed=0)
+    one = copy.deepcopy(learned())
     other = Monitor.restored(manifest(), json.loads(json.dumps(one.state())))
     # A restart is a gap: what follows has nothing to do with what was.
     one._gap()
@@ -360,9 +368,7 @@ def test_a_settling_time_is_that_of_the_tests_without_noise() -> None:
 @cache
 def learnt() -> Any:
     """What a monitor keeps whose charts have learnt."""
-    monitor = Monitor(manifest(), started_s=0.0)
-    loop(monitor, 9_000, seed=0)
-    return json.loads(json.dumps(monitor.state()))
+    return json.loads(json.dumps(learned().state()))
 
 
 ANOTHER: list[tuple[str, Any]] = [

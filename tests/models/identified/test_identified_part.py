@@ -21,7 +21,7 @@ from loopwright.pipeline.models.part import Learnt, Source
 from loopwright.pipeline.simulation.rests import local_gains
 
 LINEAR = IdentifiedPart(orders=(2, 3), units=(), minutes=0.02)
-SMALL = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.05)
+SMALL = IdentifiedPart(orders=(2, 2), units=(6,), minutes=0.02)
 
 
 def identified(learnt: Learnt) -> Identified:
@@ -136,7 +136,7 @@ def test_a_gain_that_changes_needs_a_network() -> None:
 
 def test_the_same_record_gives_the_same_bytes(tmp_path: Path) -> None:
     source = Source(made_plants.hammerstein(150), made_plants.signals_of(1, 1), seed=3)
-    part = IdentifiedPart(orders=(2, 2), units=(3,), minutes=0.01)
+    part = IdentifiedPart(orders=(2, 2), units=(3,), minutes=0.003)
     models = [identified(part.learn(source)).state_dict() for _ in range(2)]
     assert all(torch.equal(models[0][name], value) for name, value in models[1].items())
 

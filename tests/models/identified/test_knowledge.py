@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import made_plants
@@ -23,7 +24,7 @@ from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.records.record import Record
 
-QUICK = IdentifiedPart(minutes=0.2, orders=(2, 4), units=())
+QUICK = IdentifiedPart(minutes=0.2, orders=(2, 2), units=())
 UNCERTAIN = OperatedLoop(gain=2.0, dead=3, kc=0.5, ti=10.0, hold=200, sp=4.0)
 CERTAIN = LOOPS["steps by hand, small loads"]  # of gain -2
 INF = float("inf")
@@ -59,10 +60,14 @@ def test_the_word_of_an_engineer_decides_what_the_record_leaves_open() -> None:
     assert "known" not in figures(alone)["proof"]
 
 
+@cache
+def certain(said: str) -> dict[str, Any]:
+    return learnt(CERTAIN.record(1_500, 0), SIGNALS, ("y", "u", said))
+
+
 @pytest.mark.parametrize("said", ["+", "gain -0.6..-0.2"])
 def test_what_the_record_is_certain_to_contradict_is_a_question_and_bends_no_model(said: str) -> None:
-    record = CERTAIN.record(1_500, 0)
-    asked, true = learnt(record, SIGNALS, ("y", "u", said)), learnt(record, SIGNALS, ("y", "u", "gain -3..-1"))
+    asked, true = certain(said), certain("gain -3..-1")
     (of,) = figures(asked)["proof"]["known"]
     assert of["verdict"] == "contradicted"
     assert of["question"] in sign_doubts(asked)

@@ -19,7 +19,7 @@ from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
 
-PART = IdentifiedPart(orders=(2, 3), units=(6,), minutes=0.05)
+PART = IdentifiedPart(orders=(2, 2), units=(6,), minutes=0.05)
 ROWS = 2_000
 
 

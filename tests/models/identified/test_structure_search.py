@@ -18,7 +18,7 @@ from loopwright.pipeline.models.identified.structure_search import Searched
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
 
-PART = IdentifiedPart(orders=(2, 2), units=(3,), minutes=0.01)
+PART = IdentifiedPart(orders=(2, 2), units=(3,), minutes=0.003)
 
 
 def numbers(searched: Searched) -> list[bytes]:
