@@ -78,7 +78,7 @@ def test_what_the_plant_does_not_feel_keeps_its_noise_and_its_readings() -> None
 
 
 def test_a_reading_that_follows_the_output_foresees_nothing_of_it() -> None:
-    """A fit may take a level of it, which knows later readings; what inputs foresee is told by a loop's own readings."""
+    """A fit may take a level of it, which knows later readings; what inputs foresee is told by earlier ones alone."""
     rng, rows = np.random.default_rng(0), 3000
     y, u, d = np.zeros(rows), np.zeros(rows), np.zeros(rows)
     x = load = integral = 0.0
