@@ -385,7 +385,7 @@ def _events(moves: Mapping[Any, Any]) -> list[Event]:
 
 # --------------------------------------------------------------------------------------------------------------- parts
 def _signals_of(record: Record) -> Signals:
-    """As many set points as there are MVs for, of the first process variables."""
+    """The signals of a record: the first process variables have set points, as many as there are MVs for."""
     n = min(len(record.pv_signals), len(record.mv_signals))
     return Signals(record.period_s, record.pv_signals[:n], record.pv_signals, record.dv_signals, record.mv_signals)
 

@@ -88,9 +88,9 @@ def levels(signals: Array, noise: Array, change: Array) -> Array:
 
         min over d:   sum (s(k) - d(k))^2 / noise^2 + sum (d(k) - d(k-1))^2 / change^2
 
-    The fixed-interval smoother of the filter of ``level_gain``. Of a random walk in white noise the part
-    of the signal that it misses goes with none of the levels, so that a plant has the gain to d that it has to the
-    signal without noise; of others nearly so. s itself holds noise that the plant never felt, which makes gains too
+    The fixed-interval smoother of the filter of ``level_gain``. The part of a random
+    walk in white noise that they miss goes with none of the levels, so that a plant has the gain to d that it has to
+    the walk; other signals come near to that. s itself holds noise that the plant never felt, which makes gains too
     small (Carroll et al., Measurement Error in Nonlinear Models, 2006, ch. 4). Without noise d = s.
     """
     found = signals.copy()

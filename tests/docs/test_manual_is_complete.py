@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import re
+import runpy
 from collections.abc import Iterator
 
 import pytest
@@ -64,7 +65,9 @@ def asked() -> set[str]:
     return {
         text
         for page in DOCS.rglob("*.md")
-        for text in re.findall(r"^```\{generated\} (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+        for text in re.findall(
+            r"^(?:```\{generated\}|<!-- generated:) (.+?)(?: -->)?$", page.read_text("utf-8"), re.MULTILINE
+        )
     }
 
 
@@ -77,7 +80,7 @@ def test_a_law_has_its_theory_page(law: str) -> None:
     assert not missing, f"{page.name} says next to nothing under {missing}"
     assert "\n$$\n" in text, "give the law's formula"
     assert "```{diagram}" in text, "draw the law"
-    assert f"```{{generated}} law {law}\n" in text
+    assert f"<!-- generated: law {law} -->\n" in text
     assert f"```{{generated}} results {law}\n" in text
     assert re.search(rf"figures/closed_loop_{law}\.png\)", text)
     assert f"\n{law}\n" in (DOCS / "theory" / "index.md").read_text(encoding="utf-8")
@@ -94,6 +97,12 @@ def test_a_theory_page_names_parameters_as_they_are(law: str) -> None:
 
 def test_no_theory_page_is_of_a_law_that_is_gone() -> None:
     assert {page.stem for page in (DOCS / "theory").glob("*.md")} == {*LAWS, "index"}
+
+
+def test_what_is_generated_is_as_the_code_has_it() -> None:
+    """``python tools/reference_pages.py`` writes it."""
+    tool = runpy.run_path(str(DOCS.parent / "tools" / "reference_pages.py"))
+    assert [page.name for page in tool["pages"]()] == []
 
 
 def test_everything_that_is_generated_stands_on_a_page() -> None:

@@ -18,7 +18,7 @@ LATEST = 60
 """Most rows by which the answer to a measured disturbance is looked for."""
 
 POLES = (0.3, 0.5, 0.7, 0.8, 0.9, 0.96)
-"""Of the lag by which an output answers, one of them; more at a time would rebuild a signal from its level."""
+"""Poles of the lag by which an output answers, one of them; more at a time rebuild a signal from its level."""
 
 BY_CHANCE = 1.0
 """Nats by which a signal or its level may explain the outputs better than the other one does by chance."""
