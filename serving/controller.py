@@ -179,7 +179,7 @@ class Controller:
     def compute(self, given: Array) -> Array:
         """The graph's outputs (n, n_out) of rows (n, n_in), one after the other, with none of the checks of ``step``.
 
-        Rows lie as ``places`` says. Of a row that is not finite, and of one that cannot be computed, all is nan.
+        Rows lie as ``places`` says. A row that is not finite, or that cannot be computed, gives nan.
         """
         taken = np.full((len(given), len(self._out)), np.nan)
         fit = np.all(np.isfinite(given), axis=1)

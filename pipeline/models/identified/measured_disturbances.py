@@ -31,7 +31,7 @@ ENOUGH = 3
 class Disturbances:
     """Standard deviations (n_dv,) of the noise of readings and of their own change a period, scaled, and ``sure``.
 
-    What turns back a row later is noise, or a quick motion of the disturbance itself. The outputs tell the two apart.
+    Noise turns back a row later, and so does a quick motion of the disturbance itself. The outputs tell the two apart.
     An ARX explains more of them by the levels where it is noise, and by the readings where the plant feels their quick
     motion: ``noise`` is then 0. Where they tell neither, ``noise`` is what it seems, and a fit takes the readings. It
     takes the levels of those that are ``sure`` (n_dv,). Later readings of one that follows the outputs would tell of
@@ -44,7 +44,7 @@ class Disturbances:
 
     @classmethod
     def of(cls, data: ScaledRecord, told_by: ScaledRecord, n_mv: int) -> Self:
-        """Of a record; the rows ``told_by`` tell noise from motion, as long records need no more."""
+        """Those of a record; the rows ``told_by`` tell noise from motion, as long records need no more."""
         noise, change = noise_and_change([data.v[i:j, n_mv:] for i, j in data.bounds()])
         sure = np.zeros(len(noise), dtype=bool)
         for j in np.flatnonzero(noise > 0).tolist():
