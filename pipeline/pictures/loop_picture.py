@@ -20,6 +20,7 @@ from loopwright.serving.manifest import Signal
 Array = NDArray[np.float64]
 LATE = 10  # an error stays that is there over the last tenth of a run
 STAYS, AT_END = 0.002, 0.001  # of a range: an error that counts, and the distance of an MV that rests at an end
+DPI = 120.0
 STRIP = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
 
 
@@ -96,7 +97,9 @@ def write_csv(path: Path, plant: Simulator, history: History) -> None:
     _replace(path, write)
 
 
-def draw(path: Path, plant: Simulator, history: History, title: str, marks: Mapping[float, str]) -> None:
+def draw(
+    path: Path, plant: Simulator, history: History, title: str, marks: Mapping[float, str], dpi: float = DPI
+) -> None:
     """Controlled variables with their set points, MVs, events and modes; PipelineError where it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -140,7 +143,7 @@ def draw(path: Path, plant: Simulator, history: History, title: str, marks: Mapp
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small", frameon=False)
     axes[-1].set_xlabel("time [s]")
-    _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=120))
+    _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=dpi))
 
 
 def _label(signal: Signal) -> str:
