@@ -99,7 +99,7 @@ class PlantData:
 
     @property
     def left_out(self) -> pd.DataFrame:
-        """What was not used, a row each reason: readings of each tag, and rows of the record; empty of a simulated one.
+        """Readings of each tag, and rows of the record, that are not used: a row each reason; empty of a simulated one.
 
         A row of the record is left out where a tag has no value for it.
         """
@@ -202,10 +202,14 @@ class Identification:
 
     @cached_property
     def plant(self) -> OwnPlant:
-        """The model as a plant, with its noise, that begins at the medians of the record."""
+        """The model as a plant, with its noise, that begins at rest at the medians of the record's inputs."""
+        return self.plant_later(0.0)
+
+    def plant_later(self, periods: float) -> OwnPlant:
+        """The same, whose parameter ``dead_time`` may be so many periods: in ``plant`` what the record leaves open."""
         arrays = {name: np.asarray(getattr(self.model, name)) for name in MODEL_ARRAYS}
         mv, dv = (np.median(values, axis=0) for values in (self.data.record.mv, self.data.record.dv))
-        plant = OwnPlant.of_model(arrays, self.data.signals, name=NOTEBOOK, mv=mv, dv=dv)
+        plant = OwnPlant.of_model(arrays, self.data.signals, name=NOTEBOOK, mv=mv, dv=dv, dead=periods)
         vars(plant).update(title="the model")  # its runs are told from those of the plant itself
         return plant
 
@@ -362,7 +366,9 @@ def simulate(
     noise: bool = False,
     seed: int = 0,
 ) -> Run:
-    """A controller file in closed loop over a plant, from the rest in the middle of the set point's range.
+    """A controller file in closed loop over a plant, from a rest.
+
+    A plant in equations begins in the middle of the set point's range, any other, as a model, at its ``start``.
 
     Parameters
     ----------
@@ -405,7 +411,7 @@ def _events(moves: Mapping[Any, Any]) -> list[Event]:
 
 # --------------------------------------------------------------------------------------------------------------- parts
 def _signals_of(record: Record) -> Signals:
-    """As many set points as there are MVs for, of the first process variables."""
+    """The signals of a record: the first process variables have set points, as many as there are MVs."""
     n = min(len(record.pv_signals), len(record.mv_signals))
     return Signals(record.period_s, record.pv_signals[:n], record.pv_signals, record.dv_signals, record.mv_signals)
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageChops
 
 from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.pictures.png import fewer_colours, png
 from loopwright.pipeline.workbench import (
@@ -110,6 +110,10 @@ def test_a_file_closes_the_loop_over_the_model(found: Identification, controller
     assert run._repr_png_().startswith(b"\x89PNG")
     assert len(run._repr_png_()) < 0.7 * (tmp_path / "loop.png").stat().st_size
     assert run.title == "predictive on the model"
+    late = {"dead_time": {0: 4}}
+    with pytest.raises(PlantError, match="must be 0 to 1"):
+        simulate(controller, found.plant, {0: 50.0}, disturbances=late)
+    assert simulate(controller, found.plant_later(4), {0: 50.0, 60: 55.0}, disturbances=late).mae["TI.PV"] > 0
     noisy = simulate(controller.path, found.plant, {0: 50.0}, noise=True, duration_s=600).frame()
     assert (noisy["measured TI.PV"] - noisy["TI.PV"]).std() == pytest.approx(0.1, rel=0.4)
 

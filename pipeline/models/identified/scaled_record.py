@@ -201,8 +201,9 @@ def may_act_in_its_row(data: ScaledRecord, n_mv: int) -> bool:
 def noise_of_disturbances(data: ScaledRecord, n_mv: int) -> tuple[Array, Array]:
     """Standard deviations (n_dv,) of the measured disturbances' noise and of their own change, scaled.
 
-    What turns back a row later is noise, or a quick motion of the disturbance itself. The outputs tell the two apart:
-    an ARX explains more of them by the levels where it is noise, and by the signal as it is where the plant feels it.
+    A change that turns back a row later is noise, or a quick motion of the disturbance itself. The outputs tell the two
+    apart: an ARX explains more of them by the levels where it is noise, and by the signal as it is where the plant
+    feels it.
     """
     n_dv = data.v.shape[1] - n_mv
     noise, change = noise_and_change([data.v[i:j, n_mv:] for i, j in data.bounds()])
