@@ -47,14 +47,22 @@ def executed(path: Path) -> nbformat.NotebookNode:
         coalesce_streams=True,
         on_cell_start=progress,
     ).execute()
-    clear(notebook)
+    clear(notebook, path.name)
     return notebook
 
 
-def clear(notebook: nbformat.NotebookNode) -> None:
-    """Take out what tells of the machine: versions, and the folders of the checkout, packages and temporary files."""
+def clear(notebook: nbformat.NotebookNode, name: str) -> None:
+    """Take out what tells of the machine: versions, and the folders of the checkout, packages and temporary files.
+
+    What a cell writes to stderr goes there: how far it is, and warnings, which a notebook should not have.
+    """
     notebook.metadata = nbformat.from_dict(METADATA)
     for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            if output.get("name") == "stderr":
+                print(*(f"{name}: {line}" for line in output["text"].splitlines()), sep="\n", file=sys.stderr)
+        if "outputs" in cell:
+            cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
         for output in cell.get("outputs", []):
             if "text" in output:
                 output["text"] = without_folders(output["text"])
