@@ -17,7 +17,7 @@ NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
 LARGEST_KB, LARGEST = 200, 200_000
 WITHIN_S = 600  # a minute of processor time, on a machine that does other things
 FOLDERS = re.compile(
-    r"""(?<![\w./<])/(?:home|root|Users|tmp|var|work|opt|usr|mnt|private|srv)/\w|\b[A-Za-z]:\\{1,2}\w|file://"""
+    r"""(?<![\w./<])/(?:home|root|Users|tmp|var|work|opt|usr|mnt|private|srv)/[.\w]|\b[A-Za-z]:\\{1,2}\w|file://"""
 )
 
 pytestmark = pytest.mark.skipif(
