@@ -41,7 +41,7 @@ quick: $(STAMP) # what takes seconds
 	ruff check .
 
 docs: $(STAMP) ## build the manual into build/docs, under a minute
-	@$(BIN)/python -c "import furo, myst_parser" 2> /dev/null || \
+	@$(BIN)/python -c "import furo, myst_nb" 2> /dev/null || \
 	  $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[docs]'
 	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees -c docs . build/docs
 	@echo "open build/docs/index.html"

@@ -13,7 +13,7 @@ sys.path[:0] = [str(ROOT / "tools/roots"), str(ROOT / "docs" / "_ext")]
 project = "Loopwright"
 author = "the Loopwright authors"
 copyright = "the Loopwright authors, Apache-2.0"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "manual.extension"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "manual.extension"]
 
 # Sphinx reads from the repository's root, so that a link from page to page is the same here and there.
 root_doc = "docs/index"
@@ -23,6 +23,7 @@ include_patterns = [
     "CONTRIBUTING.md",
     "CHANGELOG.md",
     "examples/**/README.md",
+    "examples/notebooks/*.ipynb",
     "pipeline/cases/bibliography.md",
     "pipeline/cases/*/README.md",
 ]
@@ -30,6 +31,8 @@ exclude_patterns = [".*", "artifacts", "build", "mlruns", "tests", "tools", "wor
 
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 4
+# Notebooks are shown as they are stored: tools/run_notebooks.py executes them.
+nb_execution_mode = "off"
 html_math_renderer = "mathml"
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"

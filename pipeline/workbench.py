@@ -36,6 +36,7 @@ from loopwright.pipeline.export.gate import export as write_controller
 from loopwright.pipeline.historian.cleaning.tags import Tag, check_tags, named, parse_tag, read_tags
 from loopwright.pipeline.historian.export_params import exported, screened_export, with_units
 from loopwright.pipeline.historian.files.file_reader import tags_in
+from loopwright.pipeline.historian.files.rejection_codes import Reason
 from loopwright.pipeline.historian.guessing import controlled_first
 from loopwright.pipeline.historian.screening import Screened, refusal
 from loopwright.pipeline.laws import LAWS, ControlLaw
@@ -45,7 +46,7 @@ from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.network_search import UNITS
 from loopwright.pipeline.models.identified.structure_search import Searched
 from loopwright.pipeline.models.part import Source
-from loopwright.pipeline.pictures.loop_picture import History, draw
+from loopwright.pipeline.pictures.loop_picture import DPI, History, draw, fewer_colours
 from loopwright.pipeline.pictures.png import png
 from loopwright.pipeline.pictures.screening_pictures import trends
 from loopwright.pipeline.plants.signals import Signals
@@ -62,6 +63,9 @@ Words = str | Sequence[str]
 
 NOTEBOOK = "notebook"
 """Name of the plant in files that are made here."""
+
+CELL_DPI = 80.0
+"""Dots an inch of the picture of a run below a notebook's cells, which is part of its file."""
 
 
 # ----------------------------------------------------------------------------------------------------- 1. the readings
@@ -91,7 +95,21 @@ class PlantData:
 
     def _repr_png_(self) -> bytes | None:
         """The trends, as a notebook shows them below a cell that ends with this record."""
-        return None if self.screened is None else png(trends(self.screened))
+        return None if self.screened is None else fewer_colours(png(trends(self.screened)))
+
+    @property
+    def left_out(self) -> pd.DataFrame:
+        """Readings of each tag, and rows of the record, that are not used: a row each reason; empty of a simulated one.
+
+        A row of the record is left out where a tag has no value for it.
+        """
+        if self.screened is None:
+            return pd.DataFrame()
+        report = self.screened.report
+        columns = {**{tag.tag: tag.readings for tag in report.tags}, "rows of the record": report.dropped_rows}
+        table = pd.DataFrame(columns, index=[r.name.lower() for r in Reason if r]).fillna(0).astype(int)
+        table = table[table.any(axis=1)]
+        return table.set_axis([Reason[name.upper()].words for name in table.index], axis=0)
 
     def page(self, path: str | Path) -> None:
         """Write the page of the screening: trends with every reading that was left out, and why."""
@@ -184,10 +202,16 @@ class Identification:
 
     @cached_property
     def plant(self) -> OwnPlant:
-        """The model as a plant, with its noise, that begins at the medians of the record."""
+        """The model as a plant, with its noise, that begins at rest at the medians of the record's inputs."""
+        return self.plant_later(0.0)
+
+    def plant_later(self, periods: float) -> OwnPlant:
+        """The same, whose parameter ``dead_time`` may be so many periods: in ``plant`` what the record leaves open."""
         arrays = {name: np.asarray(getattr(self.model, name)) for name in MODEL_ARRAYS}
         mv, dv = (np.median(values, axis=0) for values in (self.data.record.mv, self.data.record.dv))
-        return OwnPlant.of_model(arrays, self.data.signals, name=NOTEBOOK, mv=mv, dv=dv)
+        plant = OwnPlant.of_model(arrays, self.data.signals, name=NOTEBOOK, mv=mv, dv=dv, dead=periods)
+        vars(plant).update(title="the model")  # its runs are told from those of the plant itself
+        return plant
 
 
 def identify(
@@ -321,15 +345,15 @@ class Run:
     def _repr_png_(self) -> bytes:
         """The picture, as a notebook shows it below a cell that ends with this run."""
         with tempfile.TemporaryDirectory() as folder:
-            self.draw(path := Path(folder) / "run.png")
-            return path.read_bytes()
+            self.draw(path := Path(folder) / "run.png", CELL_DPI)
+            return fewer_colours(path.read_bytes())
 
-    def draw(self, path: str | Path) -> None:
-        """Write a picture of the loop."""
+    def draw(self, path: str | Path, dpi: float = DPI) -> None:
+        """Write a picture of the loop, of 9 inches by so many dots."""
         loop, n = self.loop, len(self.loop.time_s)
         sp, pv, measured, mv = ([*values] for values in (loop.sp, loop.pv, loop.measured, loop.mv))
         history = History(loop.time_s.tolist(), ["AUTO"] * n, sp, pv, measured, mv, [""] * n)
-        draw(Path(path), self.plant, history, self.title, {})
+        draw(Path(path), self.plant, history, self.title, {}, dpi)
 
 
 def simulate(
@@ -342,7 +366,9 @@ def simulate(
     noise: bool = False,
     seed: int = 0,
 ) -> Run:
-    """A controller file in closed loop over a plant, from the rest in the middle of the set point's range.
+    """A controller file in closed loop over a plant, from a rest.
+
+    A plant in equations begins in the middle of the set point's range, any other, as a model, at its ``start``.
 
     Parameters
     ----------

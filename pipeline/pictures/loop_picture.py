@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
@@ -20,6 +22,8 @@ from loopwright.serving.manifest import Signal
 Array = NDArray[np.float64]
 LATE = 10  # an error stays that is there over the last tenth of a run
 STAYS, AT_END = 0.002, 0.001  # of a range: an error that counts, and the distance of an MV that rests at an end
+DPI = 120.0
+COLOURS = 128  # lines in some colours, each with the shades of its edges
 STRIP = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
 
 
@@ -96,7 +100,9 @@ def write_csv(path: Path, plant: Simulator, history: History) -> None:
     _replace(path, write)
 
 
-def draw(path: Path, plant: Simulator, history: History, title: str, marks: Mapping[float, str]) -> None:
+def draw(
+    path: Path, plant: Simulator, history: History, title: str, marks: Mapping[float, str], dpi: float = DPI
+) -> None:
     """Controlled variables with their set points, MVs, events and modes; PipelineError where it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -140,7 +146,7 @@ def draw(path: Path, plant: Simulator, history: History, title: str, marks: Mapp
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small", frameon=False)
     axes[-1].set_xlabel("time [s]")
-    _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=120))
+    _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=dpi))
 
 
 def _label(signal: Signal) -> str:
@@ -154,3 +160,18 @@ def _replace(path: Path, write: Callable[[Path], None]) -> None:
             write(draft)
     except (OSError, ValueError) as error:
         raise PipelineError(f"{path} cannot be written: {' '.join(str(error).split())}") from error
+
+
+def fewer_colours(picture: bytes) -> bytes:
+    """A PNG in COLOURS colours, in a third of its bytes: for a page or a notebook that holds it within.
+
+    Maximum coverage keeps the colours of thin lines and small patches; the usual median cut mixes them.
+    """
+    few = (
+        Image.open(io.BytesIO(picture))
+        .convert("RGB")
+        .quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    )
+    buffer = io.BytesIO()
+    few.save(buffer, format="png", optimize=True)
+    return buffer.getvalue()

@@ -14,8 +14,8 @@ from pages import ROOT
 from loopwright.pipeline.laws import LAWS
 
 pytestmark = pytest.mark.skipif(
-    importlib.util.find_spec("furo") is None or importlib.util.find_spec("myst_parser") is None,
-    reason="sphinx, myst-parser and furo are not installed; `make docs` brings them",
+    importlib.util.find_spec("furo") is None or importlib.util.find_spec("myst_nb") is None,
+    reason="sphinx, myst-nb and furo are not installed; `make docs` brings them",
 )
 LOADED = re.compile(r"""<(?:script|img|link|iframe)\b[^>]*?\b(?:src|href)=["'](https?:|//)[^"']*["'][^>]*>""")
 

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
+from PIL import Image, ImageChops
 
 from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
-from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.pictures.loop_picture import fewer_colours
+from loopwright.pipeline.pictures.png import png
 from loopwright.pipeline.workbench import (
+    CELL_DPI,
     Identification,
     PlantData,
     design,
@@ -68,6 +74,15 @@ def test_readings_become_a_record(data: PlantData, tmp_path: Path) -> None:
     assert "<html" in (tmp_path / "page.html").read_text()
 
 
+def test_what_is_left_out_has_its_reason() -> None:
+    dirty = table()
+    dirty.loc[[100, 200], "TI.PV"], dirty.loc[300, "FI.PV"] = 900.0, np.nan
+    found = screen(dirty, **ROLES).left_out
+    assert found.index.tolist() == ["empty cell", "outside the range that was given"]
+    assert found[["TI.PV", "TI.OP", "FI.PV"]].to_numpy().tolist() == [[0, 0, 1], [2, 0, 0]]
+    assert experiment(ThiosulfateCstr(), rows=50).left_out.empty
+
+
 def test_a_file_and_a_table_are_the_same_readings(data: PlantData, tmp_path: Path) -> None:
     table().to_csv(tmp_path / "export.csv", index=False)
     by_file = screen(tmp_path / "export.csv", **ROLES)
@@ -91,10 +106,27 @@ def test_a_file_closes_the_loop_over_the_model(found: Identification, controller
     assert frame["TI.PV"].iloc[-1] == pytest.approx(55.0, abs=0.02)
     assert run.mae["TI.PV"] < 0.5
     assert 0 < run.travel["TI.OP"] < 80
-    run.draw(tmp_path / "loop.png")
-    assert (tmp_path / "loop.png").read_bytes() == run._repr_png_()
+    run.draw(tmp_path / "loop.png", CELL_DPI)
+    assert (tmp_path / "loop.png").read_bytes().startswith(b"\x89PNG")
+    assert run._repr_png_().startswith(b"\x89PNG")
+    assert len(run._repr_png_()) < 0.7 * (tmp_path / "loop.png").stat().st_size
+    assert run.title == "predictive on the model"
+    late = {"dead_time": {0: 4}}
+    with pytest.raises(PlantError, match="must be 0 to 1"):
+        simulate(controller, found.plant, {0: 50.0}, disturbances=late)
+    assert simulate(controller, found.plant_later(4), {0: 50.0, 60: 55.0}, disturbances=late).mae["TI.PV"] > 0
     noisy = simulate(controller.path, found.plant, {0: 50.0}, noise=True, duration_s=600).frame()
     assert (noisy["measured TI.PV"] - noisy["TI.PV"]).std() == pytest.approx(0.1, rel=0.4)
+
+
+def test_fewer_colours_are_the_same_colours() -> None:
+    canvas = Figure(figsize=(6, 3))
+    canvas.subplots().plot(range(9), color="#009e73")
+    picture = png(canvas)
+    before, after = (Image.open(io.BytesIO(b)).convert("RGB") for b in (picture, fewer_colours(picture)))
+    assert max(hi for _, hi in ImageChops.difference(before, after).getextrema()) < 40
+    assert (0, 158, 115) in {colour for _, colour in after.getcolors()}
+    assert len(fewer_colours(picture)) < 0.7 * len(picture)
 
 
 def test_a_plant_in_equations_needs_no_model(tmp_path: Path) -> None:
