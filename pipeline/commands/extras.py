@@ -10,7 +10,13 @@ from urllib.request import url2pathname
 
 NAME = "loopwright"
 # Packages that are imported under another name than they are installed under.
-INSTALLED_AS = {"cvxpy": "cvxpy-base", "dask": "distributed", "sklearn": "scikit-learn", "yaml": "pyyaml"}
+INSTALLED_AS = {
+    "PIL": "pillow",
+    "cvxpy": "cvxpy-base",
+    "dask": "distributed",
+    "sklearn": "scikit-learn",
+    "yaml": "pyyaml",
+}
 OWN = ("dev",)  # which tests loopwright itself
 
 
