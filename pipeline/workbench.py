@@ -46,7 +46,7 @@ from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.network_search import UNITS
 from loopwright.pipeline.models.identified.structure_search import Searched
 from loopwright.pipeline.models.part import Source
-from loopwright.pipeline.pictures.loop_picture import DPI, History, draw, fewer_colours
+from loopwright.pipeline.pictures.loop_picture import RUN_DPI, History, draw, fewer_colours
 from loopwright.pipeline.pictures.png import png
 from loopwright.pipeline.pictures.screening_pictures import trends
 from loopwright.pipeline.plants.signals import Signals
@@ -348,7 +348,7 @@ class Run:
             self.draw(path := Path(folder) / "run.png", CELL_DPI)
             return fewer_colours(path.read_bytes())
 
-    def draw(self, path: str | Path, dpi: float = DPI) -> None:
+    def draw(self, path: str | Path, dpi: float = RUN_DPI) -> None:
         """Write a picture of the loop, of 9 inches by so many dots."""
         loop, n = self.loop, len(self.loop.time_s)
         sp, pv, measured, mv = ([*values] for values in (loop.sp, loop.pv, loop.measured, loop.mv))

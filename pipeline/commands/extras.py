@@ -23,13 +23,11 @@ OWN = ("dev",)  # which tests loopwright itself
 def advice(module: str) -> str | None:
     """The extra that brings a module that is not installed, as the end of an error; None where no extra does."""
     extra = extra_of(module)
-    source = _clone() or NAME
-    how = "-e " if source != NAME else ""
-    return (
-        f"{module.partition('.')[0]} is not installed; pip install {how}'{source}[{extra}]' brings it"
-        if extra
-        else None
-    )
+    if extra is None:
+        return None
+    clone = _clone()
+    wanted = f"'{NAME}[{extra}]'" if clone is None else f"-e '{clone}[{extra}]'"
+    return f"{module.partition('.')[0]} is not installed; pip install {wanted} brings it"
 
 
 def _clone() -> str | None:

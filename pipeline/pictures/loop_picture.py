@@ -22,7 +22,7 @@ from loopwright.serving.manifest import Signal
 Array = NDArray[np.float64]
 LATE = 10  # an error stays that is there over the last tenth of a run
 STAYS, AT_END = 0.002, 0.001  # of a range: an error that counts, and the distance of an MV that rests at an end
-DPI = 120.0
+RUN_DPI = 120.0  # dots an inch of a file; those of reports are MLflow's
 COLOURS = 128  # lines in some colours, each with the shades of its edges
 STRIP = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
 
@@ -101,7 +101,7 @@ def write_csv(path: Path, plant: Simulator, history: History) -> None:
 
 
 def draw(
-    path: Path, plant: Simulator, history: History, title: str, marks: Mapping[float, str], dpi: float = DPI
+    path: Path, plant: Simulator, history: History, title: str, marks: Mapping[float, str], dpi: float = RUN_DPI
 ) -> None:
     """Controlled variables with their set points, MVs, events and modes; PipelineError where it cannot be written."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
