@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 LATE = 10  # an error stays that is there over the last tenth of a run
 STAYS, AT_END = 0.002, 0.001  # of a range: an error that counts, and the distance of an MV that rests at an end
 RUN_DPI = 120.0  # dots an inch of a file; those of reports are MLflow's
-COLOURS = 128  # lines in some colours, each with the shades of its edges
+FEW_COLOURS = 128  # lines in some colours, each with the shades of its edges
 STRIP = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
 
 
@@ -163,14 +163,14 @@ def _replace(path: Path, write: Callable[[Path], None]) -> None:
 
 
 def fewer_colours(picture: bytes) -> bytes:
-    """A PNG in COLOURS colours, in a third of its bytes: for a page or a notebook that holds it within.
+    """A PNG in FEW_COLOURS colours, in a third of its bytes: for a page or a notebook that holds it within.
 
     Maximum coverage keeps the colours of thin lines and small patches; the usual median cut mixes them.
     """
     few = (
         Image.open(io.BytesIO(picture))
         .convert("RGB")
-        .quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        .quantize(FEW_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     )
     buffer = io.BytesIO()
     few.save(buffer, format="png", optimize=True)
