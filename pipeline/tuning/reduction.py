@@ -17,6 +17,7 @@ from loopwright.pipeline.plants.simulator import Array, Simulator
 RANK = 1e-8  # singular values of the Hankel matrix below this share of the largest are rounding
 NOTHING = 1e-14  # a largest one below this share of |C| |B| is nothing at all
 DIFFERENCE = 1e-4  # of a signal's size: the step of the central differences
+ANSWERED = 1e-6  # of its largest move in a period: the CV has begun to answer
 REST = 1e-6  # of a state's size: what the start may move in one period and count as at rest
 
 
@@ -66,12 +67,13 @@ class LagWithDeadTime:
     dead_time_s: float
 
     @classmethod
-    def of(cls, lin: Linearization, pv: int = 0, mv: int = 0) -> Self:
+    def of(cls, lin: Linearization, pv: int = 0, mv: int = 0, *, dead_time_s: float = 0.0) -> Self:
         """The lag whose impulse response has the area, the mean and the variance of the plant's.
 
             k = G(0),   theta + tau = -G'(0)/G(0),   tau^2 = G''(0)/G(0) - (theta + tau)^2
 
-        Exact for a lag; never a negative dead time. Raises LawError for an unstable plant, and for
+        ``dead_time_s``: of the plant before its linearization, part of theta. Exact for a lag; never a negative dead
+        time. Raises LawError for an unstable plant, and for
         one whose impulse response has no variance above 0 (it oscillates or changes its sign).
 
         Source: Astrom and Hagglund, Advanced PID Control, section 2.4 (method of moments).
@@ -96,19 +98,20 @@ class LagWithDeadTime:
                 f"{variance:.3g} s2); choose tuning `optimized` or `manual`"
             )
         tau = min(float(np.sqrt(variance)), mean)
-        return cls(gain, tau, mean - tau)
+        return cls(gain, tau, mean - tau + dead_time_s)
 
 
-def start_lag(plant: Simulator) -> Linearization:
-    """The lags with the gain and the residence times' mean and variance of the plant near its start, first MV to CV.
+def start_lags(plant: Simulator) -> tuple[Linearization, float]:
+    """One or two lags, and a dead time [s] before them, that resemble the plant near its start, first MV to CV.
 
         r(k) = 1 - y(k)/K,   T = h sum_k r(k) - h/2,   S = 2 h^2 sum_k k r(k) - T^2
-        G(s) = K / ((t1 s + 1) (t2 s + 1)),   t1 + t2 = T,   t1^2 + t2^2 = S
+        G(s) = K exp(-theta s) / ((t1 s + 1) (t2 s + 1)),   t1 + t2 = T - theta,   t1^2 + t2^2 = S
 
     y is the response to a unit step of the MV, K its end, h the period; it follows from central differences of
-    ``step`` and ``measure``. A dead time counts as part of T; where S is too small for two lags, they are equal, and
-    where the smaller one would be below h/2, there is one lag. Raises PlantError where the start is not at rest or not
-    stable, or the CV does not follow the MV.
+    ``step`` and ``measure``. T and S are the mean and the variance of the residence times. theta is the time in which
+    the CV does not answer at all; more where S is too small for two lags after it (a chain of lags), which are then
+    equal. Where the smaller lag would be below h/2, there is one lag. Raises PlantError where the start is not at rest
+    or not stable, or the CV does not follow the MV.
     """
     x0, mv0 = (np.asarray(v, dtype=np.float64) for v in plant.start)
     dv, p, h = plant.dv_nominal, plant.parameters(), plant.period_s
@@ -139,14 +142,20 @@ def start_lag(plant: Simulator) -> Linearization:
             f"plant {plant.name!r} is no lag at its start: gain {gain:.3g}, mean residence time {time_s:.3g} s; "
             f"{remedy}"
         )
-    variance = 2 * h**2 * float(c @ phi @ ends @ ends @ rest) / gain - time_s**2
-    apart = np.sqrt(max(0.0, variance / 2 - time_s**2 / 4))
-    slow, fast = time_s / 2 + apart, time_s / 2 - apart
+    variance = max(0.0, 2 * h**2 * float(c @ phi @ ends @ ends @ rest) / gain - time_s**2)
+    answers = [abs(float(c @ np.linalg.matrix_power(phi, k) @ gamma)) for k in range(len(phi))]
+    silent = int((np.array(answers) > ANSWERED * max(answers)).argmax())
+    dead_s = max(h * silent, time_s - float(np.sqrt(2 * variance)))
+    left_s = time_s - dead_s
+    if not left_s >= h / 2:  # a dead time alone: the lag is that of a held MV
+        dead_s, left_s = time_s - h / 2, h / 2
+    apart = np.sqrt(max(0.0, variance / 2 - left_s**2 / 4))
+    slow, fast = left_s / 2 + apart, left_s / 2 - apart
     if fast < h / 2:
-        rate = np.array([[1 / time_s]])
-        return Linearization(np.zeros(1), mv0[:1], -rate, gain * rate, np.eye(1))
+        rate = np.array([[1 / left_s]])
+        return Linearization(np.zeros(1), mv0[:1], -rate, gain * rate, np.eye(1)), dead_s
     a, b = np.array([[-1 / slow, 0.0], [1 / fast, -1 / fast]]), np.array([[gain / slow], [0.0]])
-    return Linearization(np.zeros(2), mv0[:1], a, b, np.array([[0.0, 1.0]]))
+    return Linearization(np.zeros(2), mv0[:1], a, b, np.array([[0.0, 1.0]])), dead_s
 
 
 def _slope(f: Callable[[Array], Array], at: Array, by: Array, low: ArrayLike = -inf, high: ArrayLike = inf) -> Array:

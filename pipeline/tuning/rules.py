@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import inf
+from math import ceil, inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,14 +58,15 @@ class PidSettings:
 
 @dataclass(frozen=True, slots=True)
 class AllPole:
-    """The transfer function G(s) = b0 / prod(s - p_i)."""
+    """The transfer function G(s) = b0 exp(-theta s) / prod(s - p_i)."""
 
     b0: float
     poles: NDArray[np.complex128]  # largest real part first
+    dead_time_s: float = 0.0  # theta
 
     @classmethod
-    def of(cls, lin: Linearization, pv: int = 0, mv: int = 0) -> AllPole:
-        """G from one MV to one PV of a linearized plant; poles that zeros cancel are not counted.
+    def of(cls, lin: Linearization, pv: int = 0, mv: int = 0, *, dead_time_s: float = 0.0) -> AllPole:
+        """G from one MV to one PV of a linearized plant behind a dead time; poles that zeros cancel are not counted.
 
         Raises LawError where G has a finite zero or more than two poles: the tuning rules of this
         file do not hold there.
@@ -81,7 +82,7 @@ class AllPole:
                 f"parameters {', '.join(f'{m:.3g}' for m in markov)}: choose tuning {_applicable(small)}"
             )
         values = np.linalg.eigvals(a).astype(np.complex128)
-        return cls(markov[-1], values[np.argsort(-values.real)])
+        return cls(markov[-1], values[np.argsort(-values.real)], dead_time_s)
 
     @classmethod
     def near(cls, lin: Linearization, pv: int = 0, mv: int = 0) -> AllPole | LagWithDeadTime:
@@ -133,14 +134,14 @@ def imc_pid(process: AllPole | LagWithDeadTime, lambda_s: float) -> PidSettings:
     stability demands: 1 - f = lambda^2 s (s - p)/(lambda s + 1)^2. The rest is a PID exactly:
 
         poles p > 0 > -1/tau:   Kc = (1 + alpha/tau)/(b0 lambda^2),  Ti = alpha + tau,  Td = alpha tau/(alpha + tau)
-        two stable poles:       Kc = a1/(b0 lambda),  Ti = a1/a0,  Td = 1/a1,  of s^2 + a1 s + a0
+        two stable poles:       Kc = a1/(b0 (lambda + theta)),  Ti = a1/a0,  Td = 1/a1,  of s^2 + a1 s + a0
 
-    and a PI for one pole. For the lag with dead time k exp(-theta s)/(tau s + 1), with the dead time as
+    and a PI for one pole; theta is the dead time before stable poles, by exp(-theta s) = 1 - theta s. For the lag with dead time k exp(-theta s)/(tau s + 1), with the dead time as
     its first-order Pade approximation:
 
         Kc = (tau + theta/2)/(k (lambda + theta/2)),  Ti = tau + theta/2,  Td = tau theta/(2 tau + theta)
 
-    Raises LawError for two poles that are not stable.
+    Raises LawError for two poles that are not stable, and for a dead time before one.
 
     Source: [inverse_rbf, section 4.3] names the procedure; the filter for
     unstable plants is the textbook's (Morari and Zafiriou, Robust Process Control). The lag with dead
@@ -159,11 +160,16 @@ def imc_pid(process: AllPole | LagWithDeadTime, lambda_s: float) -> PidSettings:
             f"IMC gives no PID for two poles in the right half plane ({poles[0]:.3g}, {poles[1]:.3g}); use `manual`"
         )
     if not unstable:
+        slower_s = lambda_s + process.dead_time_s
         if len(poles) == 1:
             p = float(poles[0].real)
-            return PidSettings(kc=1 / (b0 * lambda_s), ti_s=-1 / p)
+            return PidSettings(kc=1 / (b0 * slower_s), ti_s=-1 / p)
         a1, a0 = float(-(poles[0] + poles[1]).real), float((poles[0] * poles[1]).real)
-        return PidSettings(kc=a1 / (b0 * lambda_s), ti_s=a1 / a0, td_s=1 / a1)
+        return PidSettings(kc=a1 / (b0 * slower_s), ti_s=a1 / a0, td_s=1 / a1)
+    if process.dead_time_s:
+        raise LawError(
+            f"IMC gives no PID for an unstable plant with a dead time of {process.dead_time_s:.3g} s; use `manual`"
+        )
     alpha = lambda_s**2 * unstable[0] + 2 * lambda_s
     if len(poles) == 1:
         return PidSettings(kc=alpha / (b0 * lambda_s**2), ti_s=alpha)
@@ -172,13 +178,13 @@ def imc_pid(process: AllPole | LagWithDeadTime, lambda_s: float) -> PidSettings:
 
 
 def simc_pid(process: AllPole, period_s: float, tau_c_s: float | None = None) -> PidSettings:
-    """Skogestad's rule for a stable plant with real poles, the sampling counted as half a period of delay.
+    """Skogestad's rule for a stable plant with real poles; half a period of sampling counts as dead time.
 
         series form  Kc = tau1/(k (tau_c + theta)),  tauI = min(tau1, 4 (tau_c + theta)),  tauD = tau2
         ideal form   Kc (1 + tauD/tauI),  Ti = tauI + tauD,  Td = tauI tauD/(tauI + tauD)
 
-    ``tau_c_s`` is the wanted closed-loop time constant; None takes tau_c = theta + period, tight
-    but with a sample to spare. Two poles need no half rule: a PID holds both time constants.
+    theta is the plant's dead time and half a period. ``tau_c_s`` is the wanted closed-loop time constant; None takes
+    tau_c = theta + period, tight but with a sample to spare. Two poles need no half rule: a PID holds both time constants.
 
     Raises LawError for poles that are unstable or complex.
 
@@ -190,7 +196,7 @@ def simc_pid(process: AllPole, period_s: float, tau_c_s: float | None = None) ->
         raise LawError(f"SIMC needs stable real poles; the plant has {shown} here: choose `imc` or another point")
     taus = -1 / poles.real
     gain = process.b0 / float(np.prod(-poles.real))
-    theta = period_s / 2
+    theta = process.dead_time_s + period_s / 2
     closed = theta + (theta + period_s if tau_c_s is None else tau_c_s)
     tau1, tau_d = float(taus[0]), float(taus[1]) if len(taus) > 1 else 0.0
     kc, tau_i = tau1 / (gain * closed), min(tau1, 4 * closed)
@@ -224,53 +230,63 @@ def itae_pid(process: LagWithDeadTime, period_s: float, sampling: float = 0.5) -
     )
 
 
-def sampled_loop(lin: Linearization, settings: PidSettings, period_s: float) -> Array:
-    """The matrix that takes [dx, mv, y, d] of the sampled closed loop one period on, set point at rest.
+def sampled_loop(lin: Linearization, settings: PidSettings, period_s: float, late: int = 0) -> Array:
+    """The matrix that takes [dx, mv, y, d, earlier mv] of the sampled closed loop one period on, set point at rest.
 
-    The loop is stable where all eigenvalues lie inside the unit circle.
+    ``late``: periods of dead time before the plant, of which so many earlier MVs are kept, the latest first. The loop
+    is stable where all eigenvalues lie inside the unit circle.
     """
     phi, gamma = lin.sampled(period_s)
     n, h, s = len(phi), period_s, settings
     columns = []
-    for state in np.eye(n + 3):
-        x, mv, y1, d1 = state[:n], state[n], state[n + 1], state[n + 2]
+    for state in np.eye(n + 3 + late):
+        x, mv, y1, d1, line = state[:n], state[n], state[n + 1], state[n + 2], state[n + 3 :]
         y = float(lin.c[0] @ x)
         d = (s.filter_s * d1 + s.td_s * (y - y1)) / (s.filter_s + h)
         mv = mv + s.kc * (-(y - y1) - h / s.ti_s * y - (d - d1))
-        columns.append(np.concatenate([phi @ x + gamma[:, 0] * mv, [mv, y, d]]))
+        line = np.concatenate([[mv], line])
+        columns.append(np.concatenate([phi @ x + gamma[:, 0] * line[-1], [mv, y, d], line[:late]]))
     return np.array(columns).T
 
 
-def peak_sensitivity(lin: Linearization, settings: PidSettings, period_s: float) -> float:
+def peak_sensitivity(lin: Linearization, settings: PidSettings, period_s: float, late: int = 0) -> float:
     """Largest |1/(1 + C G)| of the sampled loop over frequency; infinite where the loop is unstable.
 
-    1/peak is the distance of the loop's Nyquist curve from -1: 1.4 is cautious, 2 is tight.
+    1/peak is the distance of the loop's Nyquist curve from -1: 1.4 is cautious, 2 is tight. ``late``: as for
+    ``sampled_loop``.
     """
-    if np.abs(np.linalg.eigvals(sampled_loop(lin, settings, period_s))).max() >= 1:
+    if np.abs(np.linalg.eigvals(sampled_loop(lin, settings, period_s, late))).max() >= 1:
         return float("inf")
     phi, gamma = lin.sampled(period_s)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 400))
     resolvent = np.linalg.solve(
         z[:, None, None] * np.eye(len(phi)) - phi, np.broadcast_to(gamma, (len(z), *gamma.shape))
     )
-    g = (lin.c[0] @ resolvent)[:, 0]
+    g = (lin.c[0] @ resolvent)[:, 0] * z**-late
     s, back = settings, 1 - 1 / z
     derivative = s.td_s * back / (s.filter_s * back + period_s)
     loop = s.kc * (1 + period_s / s.ti_s / back + derivative) * g
     return float(np.abs(1 / (1 + loop)).max())
 
 
-def robust_imc(lin: Linearization, period_s: float, peak: float = 2.0) -> PidSettings:
+def longest_filter(process: AllPole | LagWithDeadTime, period_s: float) -> float:
+    """Periods of the longest IMC filter that is looked at; one much shorter than the dead time has no margin."""
+    return max(LONGEST_FILTER, 3 * process.dead_time_s / period_s)
+
+
+def robust_imc(lin: Linearization, period_s: float, peak: float = 2.0, *, dead_time_s: float = 0.0) -> PidSettings:
     """IMC with the shortest filter whose sampled loop keeps its peak sensitivity at ``peak`` or below.
 
-    Where none does, the filter with the smallest peak. Raises LawError where no filter stabilizes.
+    ``dead_time_s``: before the plant; the sampled loop has the next larger number of whole periods. Where no filter
+    does, the one with the smallest peak. Raises LawError where no filter stabilizes.
     """
-    process, lin = AllPole.of(lin), minimal(lin)
-    tried = [imc_pid(process, float(v)) for v in np.geomspace(0.5, LONGEST_FILTER, 90) * period_s]
-    peaks = np.array([peak_sensitivity(lin, s, period_s) for s in tried])
+    process, lin = AllPole.of(lin, dead_time_s=dead_time_s), minimal(lin)
+    late, longest = ceil(dead_time_s / period_s - 1e-9), longest_filter(process, period_s)
+    tried = [imc_pid(process, float(v)) for v in np.geomspace(0.5, longest, 90) * period_s]
+    peaks = np.array([peak_sensitivity(lin, s, period_s, late) for s in tried])
     if np.isinf(peaks).all():
         raise LawError(
-            f"no IMC filter from {0.5 * period_s:g} to {LONGEST_FILTER * period_s:g} s stabilizes the sampled loop; "
+            f"no IMC filter from {0.5 * period_s:g} to {longest * period_s:g} s stabilizes the sampled loop; "
             "shorten the period or tune by hand (`manual`)"
         )
     good = np.nonzero(peaks <= peak)[0]
@@ -305,10 +321,7 @@ def optimized_imc(
             raise LawError("no IMC filter gave a finite closed loop; check the MV's range or tune by hand (`manual`)")
         return rows[best]
 
-    longest = LONGEST_FILTER
-    if isinstance(process, LagWithDeadTime):  # a filter much shorter than the dead time has no margin
-        longest = max(longest, 3 * process.dead_time_s / period_s)
-    coarse = np.geomspace(0.8, longest, 12) * period_s
+    coarse = np.geomspace(0.8, longest_filter(process, period_s), 12) * period_s
     at, first = cheapest(coarse, (0.3, 0.6, 1.0) if optimize_weight else (base.set_point_weight,))
     ratio = float(np.sqrt(coarse[1] / coarse[0]))
     weight = first.set_point_weight

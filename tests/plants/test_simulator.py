@@ -27,7 +27,7 @@ from loopwright.pipeline.optimal.bounds import problem
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.scenario import Scenario, from_rest, held
 from loopwright.pipeline.simulation.simulate import simulate_batch, simulate_open
-from loopwright.pipeline.tuning.reduction import start_lag
+from loopwright.pipeline.tuning.reduction import start_lags
 from loopwright.serving.manifest import Signal
 
 PID = LAWS["pid"]
@@ -146,10 +146,11 @@ def test_a_plant_without_equations_is_tuned_as_the_lags_at_its_start() -> None:
 
     The first Euler step of 0.1 s already moves h1 by its end: half a step less.
     """
-    lags = start_lag(Tanks())
+    lags, dead_s = start_lags(Tanks())
     times_s = -1 / lags.eigenvalues.real
     assert -(lags.c @ np.linalg.solve(lags.a, lags.b))[0, 0] == pytest.approx(2 / 0.5, rel=1e-4)
-    assert times_s.sum() == pytest.approx(8.0 + 8.0 - 0.05, rel=1e-4)
+    assert times_s.sum() + dead_s == pytest.approx(8.0 + 8.0 - 0.05, rel=1e-4)
+    assert 0 <= dead_s < 0.1
     assert times_s == pytest.approx([8.0, 8.0], rel=0.1)
 
 
@@ -161,9 +162,71 @@ class OneTank(Tanks):
 
 
 def test_a_plant_of_one_lag_is_that_lag() -> None:
-    lag = start_lag(OneTank())
+    lag, dead_s = start_lags(OneTank())
     assert lag.a == pytest.approx(np.array([[-0.125]]), rel=2e-3)
     assert lag.b == pytest.approx(np.array([[0.5]]), rel=2e-3)
+    assert dead_s < 0.1
+
+
+class Piped(Simulator):
+    """A lag of gain 2 and 30 samples behind a pipe of 12, both from rest at 0, of any number of lags in a row."""
+
+    name = "piped"
+    title = "A lag behind a pipe"
+    pv_signals = sp_signals = (Signal("T", "K", -10.0, 10.0),)
+    mv_signals = (Signal("u", "%", -5.0, 5.0),)
+    period_s = 2.0
+    pipe, lags, tau_s = 12, 1, 60.0
+
+    @property
+    def start(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.zeros(self.pipe + self.lags), np.zeros(1)
+
+    def step(self, x: np.ndarray, mv: np.ndarray, dv: np.ndarray, p: np.ndarray) -> np.ndarray:
+        line, chain = np.concatenate([mv, x[: self.pipe]]), x[self.pipe :]
+        into, keep = np.concatenate([2 * line[-1:], chain[:-1]]), np.exp(-self.period_s / self.tau_s)
+        return np.concatenate([line[:-1], keep * chain + (1 - keep) * into])
+
+    def measure(self, x: np.ndarray) -> np.ndarray:
+        return x[-1:]
+
+
+class Chain(Piped):
+    """Five lags of 30 samples, without a pipe."""
+
+    pipe, lags = 0, 5
+
+
+class TwoLags(Piped):
+    """Two lags behind the pipe."""
+
+    lags = 2
+
+
+def test_a_dead_time_is_no_lag() -> None:
+    """A pipe of 12 samples of 2 s; a lag that is sampled counts half a period less."""
+    lag, dead_s = start_lags(Piped())
+    assert lag.a == pytest.approx(np.array([[-1 / 60.0]]), rel=1e-2)
+    assert dead_s == pytest.approx(24.0, abs=1.0)
+    lags, dead_s = start_lags(TwoLags())
+    assert -1 / lags.eigenvalues.real == pytest.approx([60.0, 60.0], rel=0.15)
+    assert dead_s == pytest.approx(24.0, abs=2.0)
+    lags, dead_s = start_lags(Chain())
+    assert (-1 / lags.eigenvalues.real).sum() + dead_s == pytest.approx(300.0, rel=0.03)
+    assert dead_s > 60.0
+
+
+@pytest.mark.parametrize("tuning", ["imc", "simc", "itae"])
+@pytest.mark.parametrize("plant", [Piped(), TwoLags(), Chain()], ids=lambda p: type(p).__name__)
+def test_a_rules_pid_settles_a_plant_with_dead_time(plant: Simulator, tuning: str) -> None:
+    """Within twenty lags, without more than a few swings: the MV travels little more than its change."""
+    law = PID.design(PID.Params(tuning=tuning), {}, plant.signals, plant).eval()
+    with torch.no_grad():
+        test = Scenario("step", "", held([1.0], 600), *plant.start)
+        loop = simulate(plant, law, test)
+    assert loop.pv[-1, 0] == pytest.approx(1.0, abs=0.02)
+    assert loop.pv.max() < 1.5
+    assert mv_travel(loop.mv)[0] < 6.0
 
 
 class AtItsLimit(OneTank):
@@ -176,7 +239,7 @@ class AtItsLimit(OneTank):
 
 
 def test_a_start_at_an_end_of_the_mvs_range_is_differenced_on_one_side() -> None:
-    assert start_lag(AtItsLimit()).b == pytest.approx(start_lag(OneTank()).b, rel=1e-6)
+    assert start_lags(AtItsLimit())[0].b == pytest.approx(start_lags(OneTank())[0].b, rel=1e-6)
 
 
 class Restless(Tanks):

@@ -203,7 +203,7 @@ class PID(ControlLaw):
             pairings(StepResponses.near_start(plant).share)
         elif params.tuning == "optimized":
             require_single_loop(plant.signals, cls.name)
-            AllPole.near(linearization(params, models, plant))
+            AllPole.near(linearization(params, models, plant)[0])
         else:
             tuned(params, models, plant.signals, plant, partial(cls, plant.signals, mv_rate=params.mv_rate))
 

@@ -19,7 +19,7 @@ from loopwright.pipeline.tuning import rules
 from loopwright.pipeline.tuning.development import DevelopmentLoops
 from loopwright.pipeline.tuning.loop_search import Loops, searched
 from loopwright.pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, gains_of, pairings
-from loopwright.pipeline.tuning.reduction import LagWithDeadTime, start_lag
+from loopwright.pipeline.tuning.reduction import LagWithDeadTime, start_lags
 from loopwright.pipeline.tuning.responses import StepResponses
 from loopwright.pipeline.tuning.rules import AllPole, PidSettings
 
@@ -69,15 +69,15 @@ def tuned(params: Any, models: Mapping[str, Model], signals: Signals, plant: Sim
     if p.tuning == "manual":
         require_numbers(p)
         return Tuned(given)
-    lin = linearization(params, models, plant)
+    lin, dead_s = linearization(params, models, plant)
     if p.tuning == "itae":
-        settings = rules.itae_pid(LagWithDeadTime.of(lin), signals.period_s, p.sampling)
+        settings = rules.itae_pid(LagWithDeadTime.of(lin, dead_time_s=dead_s), signals.period_s, p.sampling)
     elif p.tuning == "simc":
-        settings = rules.simc_pid(AllPole.of(lin), signals.period_s, p.lambda_s)
+        settings = rules.simc_pid(AllPole.of(lin, dead_time_s=dead_s), signals.period_s, p.lambda_s)
     elif p.tuning == "imc" and p.lambda_s is not None:
-        settings = rules.imc_pid(AllPole.of(lin), p.lambda_s)
+        settings = rules.imc_pid(AllPole.of(lin, dead_time_s=dead_s), p.lambda_s)
     elif p.tuning == "imc":
-        settings = rules.robust_imc(lin, signals.period_s)
+        settings = rules.robust_imc(lin, signals.period_s, dead_time_s=dead_s)
     elif p.tuning == "optimized":
         if plant is None:
             raise LawError("PID tuning `optimized` needs a simulator; take manual, imc, simc or itae")
@@ -157,19 +157,19 @@ def by_simulation(params: Any, plant: Simulator) -> bool:
     return params.tuning == "optimized" and params.operating_cv is None and not known
 
 
-def linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> Linearization:
+def linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> tuple[Linearization, float]:
     """The linearization of the part ``linearized`` if there is one, else of the plant at ``operating_cv``.
 
-    A plant without equations is approximated by one or two lags near its start.
+    And the dead time [s] before it, of a plant without equations: one or two lags resemble this one near its start.
     """
     if "linearized" in models:
         part = models["linearized"]
         if not isinstance(part, HoldsLinearization):
             raise LawError(f"law 'pid' needs a part 'linearized' that is a linearization; got one of kind {part.kind}")
-        return part.linearization()
+        return part.linearization(), 0.0
     if plant is not None and params.operating_cv is None and not isinstance(plant, EquationPlant):
-        return start_lag(plant)
+        return start_lags(plant)
     known = equations(plant, f"PID tuning {params.tuning!r} without a part `linearized`")
     sp = known.sp_signals[0]
     cv = 0.5 * (sp.low + sp.high) if params.operating_cv is None else params.operating_cv
-    return known.linearize(*known.steady_state_at(cv))
+    return known.linearize(*known.steady_state_at(cv)), 0.0
