@@ -7,9 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 
-from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.excitation import Excitation
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.models import MODELS, Model
@@ -17,11 +15,8 @@ from loopwright.pipeline.models.lagged.nnarx import NNARX
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.simulation.scenario import Scenario
-from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
+from loopwright.pipeline.simulation.simulate import Trajectory
 from loopwright.serving.manifest import Signal
-
-DV = torch.zeros(0, dtype=torch.float64)
 
 
 def trained(plant: EquationPlant, excitation: Excitation, lags: int, seed: int = 0) -> NNARX:
@@ -37,30 +32,6 @@ def designed(
 ) -> ControlLaw:
     law = LAWS[name]
     return law.design(law.Params(**params), {"nnarx": model}, signals or plant.signals, plant).eval()
-
-
-def stepper(law: ControlLaw, through: Callable[[np.ndarray], np.ndarray] = lambda mv: mv):
-    """The law as ``simulate_closed`` steps it; ``through`` stands between its MV and the plant's, both ways."""
-    state = torch.zeros(law.n_state, dtype=torch.float64)
-
-    def step(sp, pv, mv_applied):
-        nonlocal state
-        with torch.no_grad():
-            inputs = (torch.from_numpy(np.array(v)) for v in (sp, pv))
-            mv, state, info = law(*inputs, DV, torch.from_numpy(through(mv_applied)), state)
-        return through(mv.numpy()), info.numpy()
-
-    return step
-
-
-def closed(
-    law: ControlLaw, case: Case, test: Scenario, noise: float = 0.0, seed: int = 0, **through: Any
-) -> Trajectory:
-    return simulate_closed(case.plant, stepper(law, **through), test, noise=[noise], seed=seed)
-
-
-def sse(track: Trajectory, start: int = 0) -> float:
-    return float(((track.sp - track.pv)[start:] ** 2).sum())
 
 
 def info(law: ControlLaw, track: Trajectory) -> dict[str, np.ndarray]:

@@ -72,9 +72,9 @@ class LagWithDeadTime:
 
             k = G(0),   theta + tau = -G'(0)/G(0),   tau^2 = G''(0)/G(0) - (theta + tau)^2
 
-        ``dead_time_s``: of the plant before its linearization, part of theta. Exact for a lag; never a negative dead
-        time. Raises LawError for an unstable plant, and for
-        one whose impulse response has no variance above 0 (it oscillates or changes its sign).
+        ``dead_time_s``, of the plant before its linearization, is added to theta. Exact for a lag; never a negative
+        dead time. Raises LawError for an unstable plant, and for one whose impulse response has no variance above 0
+        (it oscillates or changes its sign).
 
         Source: Astrom and Hagglund, Advanced PID Control, section 2.4 (method of moments).
         """

@@ -136,8 +136,8 @@ def imc_pid(process: AllPole | LagWithDeadTime, lambda_s: float) -> PidSettings:
         poles p > 0 > -1/tau:   Kc = (1 + alpha/tau)/(b0 lambda^2),  Ti = alpha + tau,  Td = alpha tau/(alpha + tau)
         two stable poles:       Kc = a1/(b0 (lambda + theta)),  Ti = a1/a0,  Td = 1/a1,  of s^2 + a1 s + a0
 
-    and a PI for one pole; theta is the dead time before stable poles, by exp(-theta s) = 1 - theta s. For the lag with dead time k exp(-theta s)/(tau s + 1), with the dead time as
-    its first-order Pade approximation:
+    and a PI for one pole; theta is the dead time before stable poles, taken as exp(-theta s) = 1 - theta s.
+    For the lag with dead time k exp(-theta s)/(tau s + 1), with the dead time as its first-order Pade approximation:
 
         Kc = (tau + theta/2)/(k (lambda + theta/2)),  Ti = tau + theta/2,  Td = tau theta/(2 tau + theta)
 
@@ -183,8 +183,9 @@ def simc_pid(process: AllPole, period_s: float, tau_c_s: float | None = None) ->
         series form  Kc = tau1/(k (tau_c + theta)),  tauI = min(tau1, 4 (tau_c + theta)),  tauD = tau2
         ideal form   Kc (1 + tauD/tauI),  Ti = tauI + tauD,  Td = tauI tauD/(tauI + tauD)
 
-    theta is the plant's dead time and half a period. ``tau_c_s`` is the wanted closed-loop time constant; None takes
-    tau_c = theta + period, tight but with a sample to spare. Two poles need no half rule: a PID holds both time constants.
+    theta is the plant's dead time and half a period. ``tau_c_s`` is the wanted closed-loop time constant; None
+    takes tau_c = theta + period, tight but with a sample to spare. Two poles need no half rule: a PID holds both
+    time constants.
 
     Raises LawError for poles that are unstable or complex.
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from nnarx_loops import closed, designed, info, sse, trained
+from law_loops import closed, sse
+from nnarx_loops import designed, info, trained
 from scipy.stats import chi2
 
 from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase

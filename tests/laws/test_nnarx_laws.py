@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from nnarx_loops import closed, designed, info, mirrored, mirrored_in_mv, negated_in_pv, negated_signals, sse, trained
+from law_loops import closed, sse
+from nnarx_loops import designed, info, mirrored, mirrored_in_mv, negated_in_pv, negated_signals, trained
 
 from loopwright.pipeline.cases.batch_reactor.case import BatchReactorCase
 from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from law_loops import DV, stepper
 from made_up_plant import Chain, Lag
 
 from loopwright.pipeline.cases.batch_reactor.plant import BatchReactor
@@ -23,26 +24,9 @@ from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.simulation.simulate import simulate_closed
 from loopwright.pipeline.tuning.rules import AllPole, PidSettings, imc_pid, sampled_loop
 
-DV = torch.zeros(0, dtype=torch.float64)
-
 
 def tensor(*values: float) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64)
-
-
-def stepper(law: PID):
-    """The law as ``simulate_closed`` steps it."""
-    state = torch.zeros(law.n_state, dtype=torch.float64)
-
-    def step(sp, pv, mv_applied):
-        nonlocal state
-        with torch.no_grad():
-            mv, state, info = law(
-                *(torch.from_numpy(v.copy()) for v in (sp, pv)), DV, torch.from_numpy(mv_applied), state
-            )
-        return mv.numpy(), info.numpy()
-
-    return step
 
 
 @given(st.integers(0, 1000), st.floats(0.0, 2.0), st.floats(0.0, 1.0))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from law_loops import DV, closed, sse
 from shipped import required
 
 from loopwright.pipeline.cases import CASES
@@ -24,9 +24,7 @@ from loopwright.pipeline.models.lagged.arx import ARX, ArxPart
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario
-from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
 
-DV = torch.zeros(0, dtype=torch.float64)
 PH, BATCH = CASES["ph_neutralization"], CASES["batch_reactor"]
 TUNED = {"penalty": 0.35, "offset_filter": 0.25}
 
@@ -39,28 +37,6 @@ def record() -> Record:
 @pytest.fixture(scope="module")
 def arx(record: Record) -> Model:
     return ArxPart().learn(Source(record, PH.plant.signals)).model
-
-
-def stepper(law: ControlLaw, through: Callable[[np.ndarray], np.ndarray] = lambda mv: mv):
-    """The law as ``simulate_closed`` steps it; ``through`` stands between its MV and the plant's, both ways."""
-    state = torch.zeros(law.n_state, dtype=torch.float64)
-
-    def step(sp, pv, mv_applied):
-        nonlocal state
-        applied = torch.from_numpy(np.array(through(mv_applied)))
-        with torch.no_grad():
-            mv, state, info = law(torch.from_numpy(sp.copy()), torch.from_numpy(pv.copy()), DV, applied, state)
-        return through(mv.numpy()), info.numpy()
-
-    return step
-
-
-def closed(law: ControlLaw, case: Case, test: Scenario, noise: float = 0.0, seed: int = 0, **through) -> Trajectory:
-    return simulate_closed(case.plant, stepper(law, **through), test, noise=[noise], seed=seed)
-
-
-def sse(track: Trajectory, start: int = 0) -> float:
-    return float(((track.pv - track.sp)[start:] ** 2).sum())
 
 
 def designed(law: type[ControlLaw], arx: Model, case: Case = PH, **params) -> ControlLaw:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from law_loops import DV, stepper
 from shipped import required
 
 from loopwright.pipeline.cases import CASES
@@ -17,7 +18,6 @@ from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import simulate_closed
 
-DV = torch.zeros(0, dtype=torch.float64)
 PH = CASES["ph_neutralization"]
 SIGNALS = PH.plant.signals
 NUMBERS = required("self_tuning_pid")
@@ -35,19 +35,6 @@ def tensor(*values: float) -> torch.Tensor:
 
 def designed(arx: Model, **params) -> SelfTuningPid:
     return SelfTuningPid.design(SelfTuningPid.Params(**NUMBERS | params), {"arx": arx}, SIGNALS, PH.plant)
-
-
-def stepper(law: ControlLaw):
-    state = torch.zeros(law.n_state, dtype=torch.float64)
-
-    def step(sp, pv, mv_applied):
-        nonlocal state
-        with torch.no_grad():
-            inputs = (torch.from_numpy(v.copy()) for v in (sp, pv))
-            mv, state, info = law(*inputs, DV, torch.from_numpy(mv_applied), state)
-        return mv.numpy(), info.numpy()
-
-    return step
 
 
 def sse(law: ControlLaw, test: Scenario, start: int = 0) -> float:

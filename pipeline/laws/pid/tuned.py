@@ -160,7 +160,8 @@ def by_simulation(params: Any, plant: Simulator) -> bool:
 def linearization(params: Any, models: Mapping[str, Model], plant: Simulator | None) -> tuple[Linearization, float]:
     """The linearization of the part ``linearized`` if there is one, else of the plant at ``operating_cv``.
 
-    And the dead time [s] before it, of a plant without equations: one or two lags resemble this one near its start.
+    Beside it the dead time [s] before it: above 0 only for a plant without equations, whose linearization is of one
+    or two lags that resemble it near its start.
     """
     if "linearized" in models:
         part = models["linearized"]
