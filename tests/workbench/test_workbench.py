@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +31,7 @@ from loopwright.pipeline.workbench import (
 )
 from loopwright.serving.controller import Controller
 
+EXAMPLE = Path(__file__).parents[2] / "examples" / "own_plant" / "make_export.py"
 ROWS, PERIOD_S, DEAD = 1500, 10.0, 3
 GAIN, FEED_GAIN = 0.8, -1.5
 ROLES = {"pv": "TI.PV[degC]=0..100", "mv": "TI.OP[%]=0..100", "dv": "FI.PV[m3/h]=5..15"}
@@ -97,6 +100,18 @@ def test_the_model_has_the_gains_of_the_plant(found: Identification) -> None:
     assert gains.loc[("TI.PV", "TI.OP"), "dead_time_s"] == DEAD * PERIOD_S
     assert found.doubts == ""
     assert found.plant.dv_noise_std == pytest.approx([0.4], rel=0.2)
+
+
+def test_a_tank_that_settles_has_a_gain_at_a_longer_period_too(tmp_path: Path) -> None:
+    """The example's export in rows of 30 s: one part alone shows a pole beyond 1; rows of 10 s give .870 degC/%."""
+    file = tmp_path / "export.csv"
+    subprocess.run([sys.executable, str(EXAMPLE), str(file)], check=True, timeout=60)
+    data = screen(file, pv="TIC-101.PV", mv="TIC-101.OP=0..100", dv="FI-7", period_s=30)
+    found = identify(data, linear=True, minutes=0.2)
+    assert found.figures["stability"]["settles"] == 1.0
+    heat = found.figures["gains"]["TIC-101.PV"]["TIC-101.OP"]
+    assert (heat["rate"], heat["sign"]) == (False, "+")
+    assert heat["gain"] == pytest.approx(0.87, rel=0.03)
 
 
 def test_a_file_closes_the_loop_over_the_model(found: Identification, controller: Controller, tmp_path: Path) -> None:

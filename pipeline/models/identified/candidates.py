@@ -32,7 +32,7 @@ from loopwright.pipeline.models.identified.output_error import (
     residuals,
 )
 from loopwright.pipeline.models.identified.residual_tests import error_beyond_drift
-from loopwright.pipeline.models.identified.steady_states import settle
+from loopwright.pipeline.models.identified.steady_states import INTEGRATES, settle, slowest_pole
 from loopwright.pipeline.models.identified.structure import Problem, Structure
 from loopwright.pipeline.plants.simulator import Array
 
@@ -222,9 +222,10 @@ def judged_beyond_drift(problem: Problem, rows: int, task: tuple[Structure, int,
 
 
 def on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitted:
-    """The fit gone on over all rows, by fewer iterations where more end in a network that does not settle.
+    """The fit gone on over all rows, by fewer iterations where more end in a model that does not settle.
 
-    The fit as it is where it would come to contradict what is known of the plant.
+    The fit as it is where it would come to contradict what is known of the plant. A linear model that settles in its
+    fold's rows is asked to settle too.
     """
     found = _beside_what_is_known(problem, _on_all_rows(problem, structure, fitted))
     return fitted if found.against - fitted.against else found
@@ -237,9 +238,16 @@ def _on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitt
     for iterations in (30, 8, 2):
         fitter = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
         found = fitter.fit(fitted.model, whole)
-        if not (problem.settles and found.model.n_hidden and wild(found.model, problem)):
+        if not problem.settles or _settles_too(problem, found.model, fitted.model):
             return found
     return fitted
+
+
+def _settles_too(problem: Problem, found: Dynamics, begun: Dynamics) -> bool:
+    """Whether a network settles, and a linear model if the one does that it was begun with."""
+    if found.n_hidden:
+        return not wild(found, problem)
+    return slowest_pole(found) <= max(INTEGRATES, slowest_pole(begun))
 
 
 def _with_noise_on_all_rows(problem: Problem, structure: Structure, fitted: Fitted, model: Innovations) -> Fitted:
@@ -258,8 +266,7 @@ def _with_noise_on_all_rows(problem: Problem, structure: Structure, fitted: Fitt
     for iterations in (15, 4):
         fitter = PredictionError(iterations=iterations, ridge=structure.ridge)
         found = fitter.fit(model, whole, gain_alone=structure.noise == "gain")
-        bent = found.model.n_hidden > 0
-        if not (bent and problem.settles and wild(found.model.plant, problem)):
+        if not problem.settles or _settles_too(problem, found.model.plant, fitted.model.plant):
             return found
     return fitted
 
@@ -270,7 +277,7 @@ def within_limits(problem: Problem, structure: Structure, fitted: Fitted) -> Fit
     Others are returned as they are.
     """
     model = fitted.model
-    if model.n_hidden or np.abs(np.linalg.eigvals(model.plant.a)).max() <= 1:
+    if model.n_hidden or slowest_pole(model.plant) <= 1:
         return fitted
     if isinstance(model, Innovations):
         plant = model.plant

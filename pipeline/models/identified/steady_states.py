@@ -30,6 +30,11 @@ FAR = 0.25
 """Deviation of the outputs, scaled, that loads add to the rests."""
 
 
+def slowest_pole(model: Dynamics) -> float:
+    """The largest magnitude of a pole of a linear model."""
+    return float(np.abs(np.linalg.eigvals(model.a)).max())
+
+
 def settle(model: Dynamics, v: Array, start: Array | None = None, periods: int = SETTLE) -> tuple[Array, Array]:
     """(states (n, n_x), whether each stands still (n,)) after a free run under constant inputs v (n, n_v)."""
     x = np.zeros((len(v), model.n_x)) if start is None else np.array(start)

@@ -24,7 +24,7 @@ from loopwright.pipeline.models.identified.scaled_record import (
     informative,
     may_act_in_its_row,
 )
-from loopwright.pipeline.models.identified.steady_states import INTEGRATES
+from loopwright.pipeline.models.identified.steady_states import INTEGRATES, slowest_pole
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Trial, best_of
 from loopwright.pipeline.models.part import Groundwork, Source
 
@@ -33,6 +33,9 @@ SETTLES = 0.98
 
 NEARLY = 1.02
 """Relative error up to which a linear model that settles stands in for one that integrates."""
+
+CONTRADICTED = 1.25
+"""The same where the model of one fold integrates and that of another settles: an integrator shows in all parts."""
 
 FARTHER = 2.0
 """Times the largest rest of the linear model up to which rests of a network may lie."""
@@ -117,7 +120,7 @@ def select(
     search = LinearSearch.of(rounds)
     linear = search.finish(search.first_round(orders, given, lagged))
     if _integrates(linear[0]):
-        settling = [t for t in search.settling(linear) if not _integrates(t) and _nearly(t, linear[0])]
+        settling = [t for t in smallest_first([*search.settling(linear), *linear]) if _stands_in(t, linear[0])]
         linear = [*settling[:1], *(t for t in linear if t.structure != settling[0].structure)] if settling else linear
     if correction is None and _integrates(linear[0]):
         corrected = search.corrected(linear, SLOW)
@@ -170,8 +173,10 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     return Selection(linear[0], best, every, spent, problem.settles, False, gained, problem.farthest, alike)
 
 
-def _nearly(trial: Trial, best: Trial) -> bool:
-    return trial.against <= best.against and trial.error <= NEARLY * best.error
+def _stands_in(trial: Trial, best: Trial) -> bool:
+    """Whether a trial settles in all folds and errs little more than the best, which integrates in one at least."""
+    most = NEARLY if min(_slowest(best, fold) for fold in best.folds) > INTEGRATES else CONTRADICTED
+    return not _integrates(trial) and trial.against <= best.against and trial.error <= most * best.error
 
 
 def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
@@ -223,7 +228,7 @@ def _as_its_linear_model(problem: Problem, trial: Trial) -> Problem:
 
 def _slowest(trial: Trial, fold: int) -> float:
     """The largest magnitude of a pole of a fold's best fit."""
-    return float(np.abs(np.linalg.eigvals(trial.of_fold(fold)[0].model.plant.a)).max())
+    return slowest_pole(trial.of_fold(fold)[0].model.plant)
 
 
 def _curved(problem: Problem, trial: Trial) -> bool:

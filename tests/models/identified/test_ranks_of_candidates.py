@@ -18,7 +18,12 @@ from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.rounds import Rounds
 from loopwright.pipeline.models.identified.scaled_record import Fold
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure, Trial
-from loopwright.pipeline.models.identified.structure_search import _as_its_linear_model, _settling_first, by_innovations
+from loopwright.pipeline.models.identified.structure_search import (
+    _as_its_linear_model,
+    _settling_first,
+    _stands_in,
+    by_innovations,
+)
 
 STRUCTURE = Structure("balanced", 1, (0, 0), (0,))
 
@@ -76,6 +81,20 @@ def test_a_state_that_drifts_is_a_loads_where_a_model_that_settles_errs_as_littl
         assert _settling_first(two_folds(), [first, other])[0] is (other if settles else first)
     clearly, hardly, first = trial(1.002, 0.9, 0.97), trial(1.001, 0.9, 0.99), trial(1.0, 1.0, 0.9)
     assert _settling_first(two_folds(), [first, hardly, clearly])[0] is clearly
+
+
+@pytest.mark.parametrize(
+    ("best", "other", "stands_in"),
+    [
+        (trial(1.0, 0.98, 1.003), trial(1.2, 0.9, 0.9), True),
+        (trial(1.0, 0.98, 1.003), trial(1.3, 0.9, 0.9), False),
+        (trial(1.0, 0.98, 1.003), trial(1.2, 0.9, 0.9995), False),
+        (trial(1.0, 0.9999, 1.003), trial(1.01, 0.9, 0.9), True),
+        (trial(1.0, 0.9999, 1.003), trial(1.2, 0.9, 0.9), False),
+    ],
+)
+def test_an_integrator_shows_in_all_parts_of_an_open_record(best: Trial, other: Trial, stands_in: bool) -> None:
+    assert _stands_in(other, best) is stands_in
 
 
 @dataclass

@@ -10,9 +10,11 @@ import made_plants
 import numpy as np
 import pytest
 
+from loopwright.pipeline.models.identified.candidates import on_all_rows
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
 from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.steady_states import INTEGRATES, slowest_pole
 from loopwright.pipeline.models.identified.structure import Budget, Structure, Trial
 from loopwright.pipeline.models.identified.structure_search import Searched
 from loopwright.pipeline.models.part import Source
@@ -90,6 +92,21 @@ def test_a_pole_at_one_stays_only_where_the_plant_integrates(record: Record, int
     poles = [np.abs(np.linalg.eigvals(f.model.a)).max() for f in again.fits.values()]
     assert bool(min(poles) > 0.995) is integrates
     assert again.error == pytest.approx(trial.error, rel=0.05)
+
+
+def test_a_linear_model_that_settles_goes_on_to_settle_over_all_rows() -> None:
+    """A third of the record rises by half the plant's motion: over all rows, free runs fit that with a pole at 1."""
+    record = made_plants.second_order(600)
+    risen = record.pv + 20 * np.maximum(np.arange(600) - 400, 0)[:, None] / 200
+    source = Source(replace(record, pv=risen), made_plants.signals_of(1, 1))
+    searched = replace(PART, units=()).groundwork().done(source, "search")
+    trial, problem = searched.selection.linear, searched.problem
+    assert problem.settles
+    for fold in trial.folds:
+        fitted = trial.of_fold(fold)[0]
+        free = on_all_rows(replace(problem, settles=False), trial.structure, fitted)
+        assert slowest_pole(free.model) > INTEGRATES
+        assert slowest_pole(on_all_rows(problem, trial.structure, fitted).model) <= INTEGRATES
 
 
 def pole_at_one(a: np.ndarray) -> np.ndarray:
