@@ -44,7 +44,7 @@ class Disturbances:
 
     @classmethod
     def of(cls, data: ScaledRecord, told_by: ScaledRecord, n_mv: int) -> Self:
-        """Those of a record; the rows ``told_by`` tell noise from motion, as long records need no more."""
+        """The disturbances of a record; the rows ``told_by`` tell noise from motion, as long records need no more."""
         noise, change = noise_and_change([data.v[i:j, n_mv:] for i, j in data.bounds()])
         sure = np.zeros(len(noise), dtype=bool)
         for j in np.flatnonzero(noise > 0).tolist():
