@@ -137,7 +137,9 @@ def main(argv: list[str]) -> int:
         found.append(row_of(plants[name](), options.rows, options.tuning))
         print(found[-1].text, flush=True)
     over = [row.over_bound for row in found if np.isfinite(row.over_bound)]
-    print(f"over the NMPC {statistics.median(over):.2f} in the median, {max(over):.2f} at worst; ahead of the PID:")
+    if over:
+        print(f"over the NMPC {statistics.median(over):.2f} in the median, {max(over):.2f} at worst")
+    print("ahead of the PID:")
     for test in ("set points", "loads", "upsets"):
         by_pid = [row.over_pid[test] for row in found if test in row.over_pid]
         print(f"  {test}: {sum(v < 1 for v in by_pid)} of {len(by_pid)}")

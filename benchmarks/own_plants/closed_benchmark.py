@@ -12,6 +12,7 @@ import json
 import statistics
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -174,7 +175,8 @@ def summary(rows: list[tuple[Scores, Scores]]) -> str:
         have = [(others[other], best) for others, best in pairs if other in others]
         ahead = [f"{test} {sum(b[test][0] < o[test][0] for o, b in have)} of {len(rows)}" for test in tests]
         lines.append(f"ahead of the {other}: {', '.join(ahead)}")
-    ratios = [best[FIRST][0] / others["NMPC"][FIRST][0] for others, best in pairs]
+    bounds = [(others["NMPC"][FIRST][0], best[FIRST][0]) for others, best in pairs]
+    ratios = [error / bound for bound, error in bounds if isfinite(bound)]
     if ratios:
         lines.append(
             f"over the NMPC on set points: {statistics.median(ratios):.2f} in the median, {max(ratios):.2f} at worst"

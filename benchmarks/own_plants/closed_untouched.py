@@ -182,6 +182,7 @@ class Belt(ClosedPlant):
     noise: ClassVar[tuple[float, ...]] = (0.25,)
     hold: ClassVar[int] = 90
     every: ClassVar[float] = 200
+    bounded: ClassVar[bool] = False
     state_signals: ClassVar[tuple[Signal, ...]] = states(21)
     mv_signals: ClassVar[tuple[Signal, ...]] = valves()
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("%", 0.0, 100.0),)

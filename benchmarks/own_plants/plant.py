@@ -30,6 +30,7 @@ class OwnPlant(EquationPlant):
     span: ClassVar[tuple[float, float]] = (10.0, 90.0)  # of the MVs in the record
     reached: ClassVar[tuple[float, float] | None] = None  # range of MVs at rest whose outputs are set points; None: all
     hand: ClassVar[str] = "steps"  # how the record comes about: steps, operator, closed loop
+    bounded: ClassVar[bool] = True  # the NMPC's solver comes to an end
     period_s: ClassVar[float] = 10.0
     substeps: ClassVar[int] = 4
 

@@ -46,7 +46,12 @@ def model_of(plant: OwnPlant, rows: int, minutes: float | None = None) -> tuple[
 
 
 def bound_of(plant: OwnPlant, sequences: int | None = None) -> float:
-    """Set-point nMAE [%] of the NMPC that knows the equations and the state, without noise, over so many sequences."""
+    """Set-point nMAE [%] of the NMPC that knows the equations and the state, without noise, over so many sequences.
+
+    NaN of a plant with which its solver does not come to an end.
+    """
+    if not plant.bounded:
+        return np.nan
     tests = [t.scenario for t in tests_of(plant)["set points"][:sequences]]
     known = [inspect.getsource(type(plant)), *(t.digest() for t in tests)]
     path = FOLDER / f"{plant.name}-nmpc-{hashlib.sha256(''.join(known).encode()).hexdigest()[:12]}.pickle"

@@ -62,6 +62,7 @@ class Pipe(OwnPlant):
     noise: ClassVar[tuple[float, ...]] = (0.2,)
     hold: ClassVar[int] = 80
     moves: ClassVar[tuple[int, int]] = (6, 70)
+    bounded: ClassVar[bool] = False
     state_signals: ClassVar[tuple[Signal, ...]] = states(11)
     mv_signals: ClassVar[tuple[Signal, ...]] = valves()
     pv_signals: ClassVar[tuple[Signal, ...]] = (signal("g/l", 0.0, 100.0),)
