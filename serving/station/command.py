@@ -255,8 +255,8 @@ def _run(options: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: station.end())
     report = station.run(options.scans)
-    if station.last is not None:
-        station.tell(_left(station.manifest, station.last[1]))
+    if station.snapshot is not None:
+        station.tell(_left(station.manifest, station.snapshot.command))
     station.tell(f"{report.scans} scans, {report.missed} periods missed, {report.faults} scans with a fault")
     lost = station.journal.lost
     station.tell(f"journal: {settings.journal.file}" + (f"; {lost} scans and events are lost" if lost else ""))

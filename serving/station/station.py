@@ -46,7 +46,7 @@ from loopwright.serving.station.startup import (
     nodes_before,
     usable,
 )
-from loopwright.serving.station.views import about, picture, state
+from loopwright.serving.station.views import Snapshot, about, picture, state
 from loopwright.serving.trust import Controller as TrustedController
 from loopwright.serving.trust import ending, signer
 from loopwright.serving.words import first_line
@@ -115,10 +115,9 @@ class Station:
         self.watching = Watching(self.controller, self.recorder)
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
-        self.last: tuple[Sample | None, Command, float] | None = None  # with when that was, since 1970
+        self.snapshot: Snapshot | None = None  # of the last scan; all that other threads read of it
         self._left_at: Array | None = None  # shape: (n_mv,), the last command that was known
-        self.stepped: Controller | None = None  # the controller of that scan
-        self.scans = self.faults = self.missed = 0
+        self.scans = self._faults = self._missed = 0
         self._blind = False  # begun without a value of the plant, and none since
         self.warnings: list[str] = []
         self.ended = False
@@ -132,9 +131,14 @@ class Station:
         """Manifest of the first controller: the signals that are read, whichever controller takes over."""
         return self.controller.manifest
 
+    @property
+    def in_charge(self) -> Controller:
+        """The controller of the next scan."""
+        return self.controller if self.snapshot is None else self.snapshot.controller
+
     def ending(self) -> list[str]:
         """A line for what the loop runs by and that ends soon: its controller's signature, its certificate."""
-        lines = ending(self.controller if self.loop is None else self.loop.controller)
+        lines = ending(self.in_charge)
         return [*lines, *filter(None, (certificate.words() for certificate in self.certificates))]
 
     def ask(self, change: Change) -> None:
@@ -220,7 +224,7 @@ class Station:
     def _before(self, k: int) -> None:
         """Changes that were asked for, here or on the plant's side."""
         assert self.loop is not None
-        self.missed = k - self.scans
+        self._missed = k - self.scans
         self._at_last(self.loop)
         # Before the first scan nobody knows where the MV stands.
         while self.scans and not self.changes.empty():
@@ -290,14 +294,18 @@ class Station:
         """Write the scan down, and show it."""
         assert self.loop is not None
         self._moved(self.loop)
-        self.scans, self.faults = self.scans + 1, self.faults + bool(command.reason)
-        self.last, self.stepped = (sample, command, time.time()), self.recorder.controller
+        self.scans, self._faults = self.scans + 1, self._faults + bool(command.reason)
+        seen, stepped = (sample, command, time.time()), self.recorder.controller
         if not np.isnan(command.mv).any():
             self._left_at = command.mv
-        self.recorder.scan(self.loop, sample, command)
-        self.watching.seen(self.stepped, self.last)
-        for seen in self._watchers:
-            seen(sample, command)
+        try:
+            self.recorder.scan(self.loop, sample, command)
+            self.watching.seen(stepped, seen)
+        finally:  # a scan that cannot be written down is a scan
+            counts = self._missed, self._faults
+            self.snapshot = Snapshot.of(self.loop, self.watching.monitor, seen, stepped, counts)
+        for show in self._watchers:
+            show(sample, command)
 
     def _moved(self, loop: ControlLoop) -> None:
         """Say where an MV stands that somebody else moved while the loop could not write."""
@@ -320,8 +328,7 @@ class Station:
 
         Its first steps are another process's: a file that ends a process does not end this one.
         """
-        charge = self.controller if self.loop is None else self.loop.controller
-        return tried(charge.path.parent / file, sha256, self.trusted)
+        return tried(self.in_charge.path.parent / file, sha256, self.trusted)
 
     def answer(self, tree: Any) -> Answer:
         """The answer to a request, from any thread: a view, or the change once a scan has carried it out."""
@@ -348,7 +355,7 @@ class Station:
 
     def _view(self, name: str) -> Answer:
         if name == "picture":
-            path = picture(self.controller if self.loop is None else self.loop.controller)
+            path = picture(self.in_charge)
             return {"file": None if path is None else str(path.absolute())}
         return about(self) if name == "about" else state(self)
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from loopwright.serving.controller import Controller
+from loopwright.serving.guard import Sample
 from loopwright.serving.journal import columns
+from loopwright.serving.loop import Command, ControlLoop
+from loopwright.serving.monitor import Monitor, Verdict
 from loopwright.serving.opcua.values import words
 from loopwright.serving.proof import judged
 from loopwright.serving.trust import signer
@@ -25,9 +28,48 @@ SILENT_PERIODS = 3  # without a scan: the loop counts as dead
 PICTURES = ("{stem}.png", "figures/closed_loop_{stem}.png")
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """The loop as a scan left it.
+
+    The loop's own thread makes one after each scan. Who answers others reads nothing else of the loop and its monitor,
+    so that no answer is half of one scan and half of the next.
+    """
+
+    seen_s: float  # since 1970
+    sample: Sample | None
+    command: Command
+    controller: Controller  # in charge of the next scan
+    stepped: Controller  # that gave this command; another one where a swap followed
+    successor: View | None  # on trial
+    replaced: Controller | None
+    missed: int  # periods
+    faults: int  # scans
+    verdicts: tuple[Verdict, ...]
+    numbers: Mapping[str, float]
+
+    @classmethod
+    def of(
+        cls,
+        loop: ControlLoop,
+        monitor: Monitor,
+        seen: tuple[Sample | None, Command, float],
+        stepped: Controller,
+        counts: tuple[int, int],
+    ) -> Self:
+        """After a scan ``seen``, by the controller ``stepped``; ``counts``: periods missed, scans with a fault."""
+        sample, command, seen_s = seen
+        new = loop.successor
+        successor = None
+        if new is not None:
+            successor = {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
+        told = tuple(monitor.verdicts()), monitor.numbers()
+        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, *told)
+
+
 def about(station: Station) -> View:
     """Description of the loop: its controller, its signals, the controllers that could take its place."""
-    controller = station.loop.controller if station.loop is not None else station.controller
+    controller = station.in_charge
     m = controller.manifest
     groups = {"sp": m.sp, "pv": m.pv, "mv": m.mv, "dv": m.dv}
     return {
@@ -47,8 +89,8 @@ def about(station: Station) -> View:
 
 def state(station: Station) -> View:
     """How the loop stands now."""
-    loop, last, now = station.loop, station.last, time.time()
-    if loop is None or last is None:
+    seen, now = station.snapshot, time.time()
+    if seen is None:
         trouble = station.endpoint.trouble
         return {
             "time": now,
@@ -61,13 +103,13 @@ def state(station: Station) -> View:
             "verdicts": [],
             "warnings": station.ending(),
         }
-    sample, command, seen_s = last
+    sample, command = seen.sample, seen.command
     applied = None if sample is None else sample.mv_applied
     patience = SILENT_PERIODS * station.manifest.period_s / station.settings.speed
     return {
-        "time": seen_s,
+        "time": seen.seen_s,
         "scan": command.scan,
-        "alive": now - seen_s <= patience,
+        "alive": now - seen.seen_s <= patience,
         "mode": command.mode.value,
         "reason": command.reason,
         "sp": _plain(command.sp),
@@ -77,19 +119,19 @@ def state(station: Station) -> View:
         "law": _plain(command.law_mv),
         "beside": _plain(command.successor_mv),
         "dv": _plain(None if sample is None else sample.dv),
-        "info": _plain(command.info if station.stepped is loop.controller else None),  # of the names in ``about``
+        "info": _plain(command.info if seen.stepped is seen.controller else None),  # of the names in ``about``
         "quality": [] if sample is None else [words(status) for status in sample.quality],
-        "sha256": loop.controller.sha256,
-        "successor": _successor(station),
-        "replaced": None if loop.replaced is None else _named(loop.replaced),
+        "sha256": seen.controller.sha256,
+        "successor": seen.successor,
+        "replaced": None if seen.replaced is None else _named(seen.replaced),
         "connection": station.endpoint.trouble,
         "connections": station.endpoint.connections,
         "journal": station.journal.trouble,
         "journal_lost": station.journal.lost,
-        "missed": station.missed,
-        "faults": station.faults,
-        "verdicts": [asdict(v) for v in station.watching.monitor.verdicts()],
-        "numbers": station.watching.monitor.numbers(),
+        "missed": seen.missed,
+        "faults": seen.faults,
+        "verdicts": [asdict(v) for v in seen.verdicts],
+        "numbers": dict(seen.numbers),
         "warnings": station.ending(),
     }
 
@@ -101,13 +143,6 @@ def _plain(values: Iterable[float] | None) -> list[float | None] | None:
 
 def _named(controller: Controller) -> View:
     return {"law": controller.manifest.law, "file": controller.path.name, "sha256": controller.sha256}
-
-
-def _successor(station: Station) -> View | None:
-    new = None if station.loop is None else station.loop.successor
-    if new is None:
-        return None
-    return {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
 
 
 def _card(controller: Controller) -> View:

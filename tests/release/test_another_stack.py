@@ -192,7 +192,7 @@ def _fault_and_restart(settings: Path, server: NodeServer) -> None:
     journal = loop.settings.journal.file
 
     def becomes(mode: Mode) -> bool:
-        return within(40, lambda: loop.station.last is not None and loop.station.last[1].mode is mode)
+        return within(40, lambda: (seen := loop.station.snapshot) is not None and seen.command.mode is mode)
 
     try:
         assert not server.moves()  # a shadow writes nothing

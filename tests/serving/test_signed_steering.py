@@ -101,7 +101,7 @@ def test_a_swap_to_a_trusted_file_is_written_down_with_its_signer(trusting: Path
 def test_the_operator_sees_before_it_that_a_signature_ends(
     trusting_loop: RunningLoop, monkeypatch: pytest.MonkeyPatch, days: int, told: int
 ) -> None:
-    assert within(20, lambda: trusting_loop.station.last is not None)
+    assert within(20, lambda: trusting_loop.station.snapshot is not None)
     loop, journal = trusting_loop.station.loop, trusting_loop.settings.journal.file
     assert loop is not None
     signed = signer(loop.controller)

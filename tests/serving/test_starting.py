@@ -127,7 +127,7 @@ def test_a_loop_that_is_ended_between_two_scans_does_not_wait_for_the_next(
     made, plant = make_station("AUTO")
     thread = threading.Thread(target=made.run)
     thread.start()
-    assert in_time(20, lambda: made.last is not None)
+    assert in_time(20, lambda: made.snapshot is not None)
     made.end()
     thread.join(60)
     assert not thread.is_alive()
@@ -269,7 +269,7 @@ def test_a_controller_that_is_tried_lies_beside_the_one_in_charge(
     made, _ = make_station("SHADOW")
     shutil.copy(PID, tmp_path / "elsewhere.onnx")
     assert made._opened("pid.onnx", None).path == PID
-    made.loop = SimpleNamespace(controller=Controller(tmp_path / "elsewhere.onnx"))  # type: ignore[assignment]
+    made.snapshot = SimpleNamespace(controller=Controller(tmp_path / "elsewhere.onnx"))  # type: ignore[assignment]
     assert made._opened("elsewhere.onnx", None).path == tmp_path / "elsewhere.onnx"
 
 

@@ -11,6 +11,7 @@ import json
 import math
 import re
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -28,6 +29,7 @@ from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving import Controller, LoopError, Mode
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.journal.reader import Entry
+from loopwright.serving.monitor import Monitor, Verdict
 from loopwright.serving.page.app import candidates
 from loopwright.serving.station.control import ask
 
@@ -133,6 +135,24 @@ def test_modes_set_points_and_mvs(
     assert "change anna: MV T_j 250 -> 260 K" in events
     refused = [event for event in events if "refused" in event and UNKNOWN not in event]
     assert refused == []  # what is refused there never came to the loop
+
+
+def test_who_asks_reads_what_the_last_scan_left(
+    loop: RunningLoop, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The monitor works in the loop's thread; another one that read it while it works would see half of a scan."""
+    threads = set[int | None]()
+    kind = type(loop.station.watching.monitor)
+    verdicts = kind.verdicts
+
+    def told(self: Monitor) -> list[Verdict]:
+        threads.add(threading.get_ident())
+        return verdicts(self)
+
+    monkeypatch.setattr(kind, "verdicts", told)
+    first = state(capsys)["scan"]
+    assert within(20, lambda: state(capsys)["scan"] > first + 3)
+    assert threads == {loop.thread.ident}
 
 
 def test_a_controller_is_tried_takes_over_and_is_put_back(

@@ -63,8 +63,8 @@ def lease(plant: Plant, text: str | None = None) -> Any:
 
 
 def mode(loop: RunningLoop) -> tuple[Mode, str]:
-    assert loop.station.last is not None
-    return loop.station.last[1].mode, loop.station.last[1].reason
+    assert loop.station.snapshot is not None
+    return loop.station.snapshot.command.mode, loop.station.snapshot.command.reason
 
 
 def test_the_second_loop_holds_until_the_first_is_gone(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -97,17 +97,37 @@ def test_what_fails_in_watching_is_told_once_and_raises_nothing(
     assert "OverflowError" in said
 
 
+def station_that(did: list[str], write: Callable[..., object]) -> Station:
+    """As much of a station as a scan is shown with; ``write`` writes it down."""
+    controller = Controller(FILE)
+    monitor = Monitor(controller.manifest, started_s=1e9)
+    return cast(Station, SimpleNamespace(
+        loop=SimpleNamespace(controller=controller, successor=None, replaced=None), _moved=lambda loop: None,
+        scans=0, _faults=0, _missed=0, _watchers=[lambda *_: did.append("others")], snapshot=None,
+        recorder=SimpleNamespace(controller=controller, scan=write),
+        watching=SimpleNamespace(seen=lambda *_: did.append("monitor"), monitor=monitor),
+    ))  # fmt: skip
+
+
 def test_a_scan_is_written_down_before_anybody_looks_at_it() -> None:
     did = list[str]()
-    station = SimpleNamespace(
-        loop=SimpleNamespace(found=None), endpoint=SimpleNamespace(values=None), scans=0, faults=0, _watchers=[],
-        _moved=lambda loop: None,
-        recorder=SimpleNamespace(controller=None, scan=lambda *_: did.append("journal")),
-        watching=SimpleNamespace(seen=lambda *_: did.append("monitor")),
-    )  # fmt: skip
+    station = station_that(did, lambda *_: did.append("journal"))
     _, command, _ = scan_of(Controller(FILE), 0, 1e9)
-    Station._observe(cast(Station, station), None, command)
-    assert did == ["journal", "monitor"]
+    Station._observe(station, None, command)
+    assert did == ["journal", "monitor", "others"]
+
+
+def test_a_scan_that_cannot_be_written_down_is_shown() -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    station = station_that([], full)
+    _, command, _ = scan_of(Controller(FILE), 0, 1e9)
+    with pytest.raises(OSError, match="No space"):
+        Station._observe(station, None, command)
+    seen = station.snapshot
+    assert seen is not None
+    assert (seen.command, seen.faults, len(seen.verdicts) > 0) == (command, 1, True)
 
 
 @pytest.mark.parametrize("set_by_s", [0.0, -3_600.0, 86_400.0])
