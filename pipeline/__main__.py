@@ -1,15 +1,12 @@
-"""``loopwright``: the one command. Each of its commands is a module of ``loopwright.pipeline.commands``."""
+"""``loopwright``: the one command; ``loopwright.pipeline.commands`` has its commands."""
 
 from __future__ import annotations
 
-import gc
-import importlib
 import os
 import sys
 from collections.abc import Sequence
-from types import ModuleType
 
-from loopwright.pipeline.commands import COMMANDS, Parser
+from loopwright.pipeline.commands import COMMANDS, Parser, loaded
 from loopwright.pipeline.commands.extras import advice
 from loopwright.pipeline.engine.command import FAILURES, reason
 from loopwright.pipeline.errors import nearest
@@ -45,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"loopwright: unknown command {name!r}{nearest(name, COMMANDS)}", file=sys.stderr)
         return 2
     try:
-        command = _loaded(name)
+        command = loaded(name)
         parser = Parser(prog=f"loopwright {name}", description=COMMANDS[name])
         command.options(parser)
         options = parser.parse_args(words[1:])
@@ -65,21 +62,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     return status or 0
-
-
-def _loaded(name: str) -> ModuleType:
-    """The module of a command. Its imports stay: looking through them for garbage took a sixth of the time."""
-    module = f"loopwright.pipeline.commands.{name}"
-    if (found := sys.modules.get(module)) is not None:  # frozen at each call, a caller's garbage would pile up
-        return found
-    looking = gc.isenabled()
-    gc.disable()
-    try:
-        return importlib.import_module(module)
-    finally:
-        if looking:
-            gc.freeze()
-            gc.enable()
 
 
 def _help() -> str:

@@ -46,8 +46,8 @@ from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.network_search import UNITS
 from loopwright.pipeline.models.identified.structure_search import Searched
 from loopwright.pipeline.models.part import Source
+from loopwright.pipeline.pictures.drawing import png
 from loopwright.pipeline.pictures.loop_picture import RUN_DPI, History, draw, fewer_colours
-from loopwright.pipeline.pictures.png import png
 from loopwright.pipeline.pictures.screening_pictures import trends
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Simulator

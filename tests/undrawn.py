@@ -15,6 +15,6 @@ def draw_nothing(patch: pytest.MonkeyPatch) -> None:
     """
     for name in SCREENING:
         patch.setattr(f"loopwright.pipeline.report.screening.{name}", lambda found: Figure())
-    for module in ("loopwright.pipeline.pictures.png", "loopwright.pipeline.report.screening"):
+    for module in ("loopwright.pipeline.pictures.drawing", "loopwright.pipeline.report.screening"):
         patch.setattr(f"{module}.png", lambda canvas: b"")
     patch.setattr("loopwright.pipeline.pictures.drawing.lay_out", lambda canvas: None)

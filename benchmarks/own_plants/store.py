@@ -14,7 +14,7 @@ from loops import tests_of
 from plant import OwnPlant
 from record import record_of
 
-from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.case import Effort
 from loopwright.pipeline.files import write_bytes
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart

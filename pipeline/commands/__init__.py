@@ -1,11 +1,17 @@
-"""The commands of ``loopwright``, a module each: ``options`` says what it takes, ``run`` does it.
+"""The commands of ``loopwright``: ``options`` says what one takes, ``run`` does it. Most are a module here.
 
 Importing this list loads none of them, so that ``loopwright --help`` answers at once.
 """
 
 from __future__ import annotations
 
-from typing import NoReturn
+import argparse
+import gc
+import importlib
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import NamedTuple, NoReturn
 
 from loopwright.serving import arguments
 
@@ -31,6 +37,44 @@ COMMANDS = {
     "bounds": "compute what no controller of a case can beat",
     "registry": "serve, list, promote, fetch or publish registered controllers",
 }
+
+
+OF_THE_RUNTIME = dict.fromkeys(
+    ("inspect", "bench", "conformance", "keygen", "sign", "verify"), "loopwright.serving.__main__"
+)
+"""Commands that a machine without the pipeline has, too, as ``python -m loopwright.serving``."""
+
+MODULES = {"loop": "loopwright.serving.station.command", **OF_THE_RUNTIME}
+"""Modules of the commands that have none here."""
+
+
+class Command(NamedTuple):
+    """What a command takes, and what does it: the exit status, None for 0."""
+
+    options: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int | None]
+
+
+def loaded(name: str) -> Command:
+    """A command with its module, which stays: looking through its imports for garbage took a sixth of the time."""
+    module = MODULES.get(name, f"loopwright.pipeline.commands.{name}")
+    found = sys.modules.get(module)
+    if found is None:  # frozen at each call, a caller's garbage would pile up
+        looking = gc.isenabled()
+        gc.disable()
+        try:
+            found = importlib.import_module(module)
+        finally:
+            if looking:
+                gc.freeze()
+                gc.enable()
+    return _of(found, name)
+
+
+def _of(module: ModuleType, name: str) -> Command:
+    if name in OF_THE_RUNTIME:
+        return Command(*module.COMMANDS[name][1:])
+    return Command(module.options, module.run)
 
 
 class Parser(arguments.Parser):

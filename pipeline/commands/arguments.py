@@ -6,6 +6,10 @@ import argparse
 import math
 from collections.abc import Callable
 
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.serving.manifest import Manifest
+
 
 def whole(low: int, high: int | None = None) -> Callable[[str], int]:
     """Reads a whole number from ``low`` to ``high``, both included."""
@@ -37,3 +41,16 @@ def real(words: str, allowed: Callable[[float], bool] = lambda _: True) -> Calla
 def positive(unit: str = "") -> Callable[[str], float]:
     """Reads a number above 0."""
     return real("a number above 0" + (f" [{unit}]" if unit else ""), lambda value: value > 0)
+
+
+def require_made_for(manifest: Manifest, plant: Simulator) -> None:
+    """Raise ParamsError where a controller's signals, their units or its period are not the plant's."""
+    for name in ("sp", "pv", "dv", "mv"):
+        ours = [(s.name, s.unit) for s in getattr(plant, f"{name}_signals")]
+        theirs = [(s.name, s.unit) for s in manifest.signals(name)]
+        if ours != theirs:
+            raise ParamsError(f"the controller's {name} are {theirs}, but plant {plant.name!r} has {ours}")
+    if manifest.period_s != plant.period_s:
+        raise ParamsError(
+            f"the controller's period is {manifest.period_s} s, but plant {plant.name!r} has {plant.period_s}"
+        )

@@ -14,7 +14,6 @@ from loopwright.pipeline.config.params import choose
 from loopwright.pipeline.errors import PipelineError, PlantError
 from loopwright.pipeline.evaluation.case import Array, Case
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
-from loopwright.pipeline.simulation.faults import FAULTS
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -93,3 +92,6 @@ def run(options: argparse.Namespace) -> None:
         raise PipelineError(f"nothing can listen at {options.listen}: {error.strerror or error}") from None
     except KeyboardInterrupt:
         print("plant: ended", file=sys.stderr)
+
+
+FAULTS = ("", "bad", "uncertain", "frozen", "text", "deleted", "int", "nan")  # "": nothing

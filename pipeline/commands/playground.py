@@ -8,8 +8,7 @@ import tempfile
 from pathlib import Path
 
 from loopwright.pipeline.cases import all_cases
-from loopwright.pipeline.commands.arguments import whole
-from loopwright.pipeline.commands.made_for import require_made_for
+from loopwright.pipeline.commands.arguments import require_made_for, whole
 from loopwright.pipeline.config.params import choose
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.case import Case

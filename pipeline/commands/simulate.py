@@ -13,8 +13,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from loopwright.pipeline.cases import PLANTS, all_cases
-from loopwright.pipeline.commands.arguments import positive, real, whole
-from loopwright.pipeline.commands.made_for import require_made_for
+from loopwright.pipeline.commands.arguments import positive, real, require_made_for, whole
 from loopwright.pipeline.config.params import choose
 from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.evaluation.case import Case

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from loopwright.pipeline.cases import all_cases
-from loopwright.pipeline.commands.arguments import real, whole
-from loopwright.pipeline.commands.made_for import require_made_for
+from loopwright.pipeline.commands.arguments import real, require_made_for, whole
 from loopwright.pipeline.engine.cluster import address, workers_here
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import ParamsError, nearest
@@ -19,8 +18,8 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.stress.draws import Drawing
 from loopwright.pipeline.evaluation.stress.loops import Outcome, Stress, figures_of, opened
 from loopwright.pipeline.evaluation.stress.summary import Summary
+from loopwright.pipeline.pictures.drawing import save
 from loopwright.pipeline.pictures.numbers import number
-from loopwright.pipeline.pictures.png import save
 from loopwright.pipeline.pictures.stress_pictures import loop_canvas
 from loopwright.pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
 from loopwright.serving.manifest import Manifest

@@ -14,8 +14,7 @@ from loopwright.pipeline.engine import progress
 from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export.controller_file import assembled, write_sidecar
 from loopwright.pipeline.export.fusion import fused
-from loopwright.pipeline.export.graph import example_inputs, law_graph
-from loopwright.pipeline.export.operators import check_operators
+from loopwright.pipeline.export.graph import check_operators, example_inputs, law_graph
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.plants.simulator import Array

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.rate_limits import Rates, rates_of
+from loopwright.pipeline.laws.actuator import Rates, rates_of
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Array, Simulator

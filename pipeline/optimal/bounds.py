@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.case import Case, Effort
 from loopwright.pipeline.evaluation.metric import together
 from loopwright.pipeline.files import digest
 from loopwright.pipeline.plants.equations import EquationPlant, equations

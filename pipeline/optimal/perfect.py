@@ -25,8 +25,8 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.case import Effort
 from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
-from loopwright.pipeline.evaluation.effort import Effort
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
 from loopwright.pipeline.optimal.horizon import Horizon, Plan
 from loopwright.pipeline.plants.equations import EquationPlant

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFo
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import Array
 from loopwright.pipeline.evaluation.metric import NO_UNIT
+from loopwright.pipeline.files import write_bytes
 from loopwright.serving.manifest import Signal
 
 BASELINE_COLOUR = "#7f7f7f"
@@ -241,3 +244,22 @@ def clear_legend(axes: Axes, **options: Any) -> Legend:
     top = low + (high - low) / max(1.0 - taken, 0.2)
     axes.set_ylim(axes.get_ylim()[0], float(to_scale.inverted().transform(np.array([top]))[0]))
     return legend
+
+
+DPI = 100.0  # MLflow shows pictures in their own size
+
+
+def png(canvas: Canvas) -> bytes:
+    """The picture as a PNG; without date and version inside, so that equal data give equal files."""
+    canvas.dpi = DPI
+    # Matplotlib draws a canvas with a layout twice, the first time only to find it.
+    lay_out(canvas)
+    canvas.set_layout_engine(None)
+    buffer = io.BytesIO()
+    canvas.savefig(buffer, format="png", dpi=DPI, facecolor="white", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def save(canvas: Canvas, path: Path) -> None:
+    """Write the PNG whole or not at all."""
+    write_bytes(path, png(canvas))

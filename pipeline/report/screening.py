@@ -15,9 +15,8 @@ from loopwright.pipeline.historian.excitation import HELD
 from loopwright.pipeline.historian.files.rejection_codes import Reason
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.historian.step_test import StepTest
-from loopwright.pipeline.pictures.drawing import axis_label, ratio_unit
+from loopwright.pipeline.pictures.drawing import axis_label, png, ratio_unit
 from loopwright.pipeline.pictures.excitation_pictures import inputs, verdict
-from loopwright.pipeline.pictures.png import png
 from loopwright.pipeline.pictures.screening_pictures import details, readings, times_of, trends
 from loopwright.pipeline.report.templating import render
 

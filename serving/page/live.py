@@ -5,15 +5,14 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import closing
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Generic, TypeAlias, TypeVar
 
 from loopwright.serving.errors import LoopwrightError
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.journal.reader import Entry
-from loopwright.serving.page.shared import Shared
 from loopwright.serving.page.trend import plain
 from loopwright.serving.words import named
 
@@ -194,3 +193,26 @@ def _scans(columns: list[str], rows: list[tuple[float, ...]], last: int) -> str:
 def _message(event: str, data: Any, id_: int | None = None) -> str:
     head = "" if id_ is None else f"id: {id_}\n"
     return f"{head}event: {event}\ndata: {json.dumps(data, allow_nan=False)}\n\n"
+
+
+T = TypeVar("T")
+
+
+class Shared(Generic[T]):
+    """Runs ``make`` once at a time; whoever asks while it runs gets its answer.
+
+    However many pages ask, the loop is asked by one of them.
+    """
+
+    def __init__(self, make: Callable[[], Awaitable[T]]) -> None:
+        self._make = make
+        self._running: asyncio.Task[T] | None = None
+
+    async def __call__(self) -> T:
+        """The answer; raises what ``make`` raises."""
+        if self._running is None or self._running.done():
+            self._running = asyncio.create_task(self._run())
+        return await asyncio.shield(self._running)  # who leaves ends it for nobody else
+
+    async def _run(self) -> T:
+        return await self._make()

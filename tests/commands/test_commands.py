@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import io
 import os
 import subprocess
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.pipeline.__main__ import main
-from loopwright.pipeline.commands import COMMANDS, Parser
+from loopwright.pipeline.commands import COMMANDS, Parser, loaded
 from loopwright.pipeline.commands.parameters import texts, type_of
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.models import MODELS
@@ -29,9 +28,9 @@ COMMANDS_OF_TODAY = {
 def test_the_commands_are_these() -> None:
     assert set(COMMANDS) == COMMANDS_OF_TODAY
     for name in COMMANDS:
-        module = importlib.import_module(f"loopwright.pipeline.commands.{name}")
-        assert callable(module.options)
-        assert callable(module.run)
+        command = loaded(name)
+        assert callable(command.options)
+        assert callable(command.run)
 
 
 @pytest.mark.parametrize("name", ["", *COMMANDS])
@@ -131,7 +130,7 @@ def test_the_type_of_a_parameter_does_not_depend_on_how_its_module_reads_annotat
 def parsed(*words: str) -> dict[str, object]:
     """What a command reads in its words."""
     parser = Parser(prog=words[0])
-    importlib.import_module(f"loopwright.pipeline.commands.{words[0]}").options(parser)
+    loaded(words[0]).options(parser)
     found = vars(parser.parse_args(words[1:]))
     return {key: value for key, value in found.items() if not callable(value)}
 

@@ -19,8 +19,8 @@ from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization
 from loopwright.pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
 from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.evaluation.case import Effort
 from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
-from loopwright.pipeline.evaluation.effort import Effort
 from loopwright.pipeline.evaluation.metric import METRICS
 from loopwright.pipeline.optimal.bounds import (
     DEFAULTS,

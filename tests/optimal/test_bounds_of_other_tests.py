@@ -17,8 +17,7 @@ from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from loopwright.pipeline.cases.jacketed_batch_reactor.plant import COLD, HOT, LEAK, JacketedBatchReactor, SignedFlow
 from loopwright.pipeline.cases.reversible_cstr.plant import ReversibleCstr
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.evaluation.case import Array, Case
-from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.case import Array, Case, Effort
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
 from loopwright.pipeline.optimal.bounds import plant_digest

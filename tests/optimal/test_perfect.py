@@ -13,8 +13,7 @@ from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.cases.batch_reactor.plant import BatchReactor
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.case import Case, Effort
 from loopwright.pipeline.evaluation.metric import METRICS
 from loopwright.pipeline.metrics import mae
 from loopwright.pipeline.optimal.horizon import Horizon

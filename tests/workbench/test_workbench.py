@@ -16,8 +16,8 @@ from PIL import Image, ImageChops
 from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.pictures.drawing import png
 from loopwright.pipeline.pictures.loop_picture import fewer_colours
-from loopwright.pipeline.pictures.png import png
 from loopwright.pipeline.workbench import (
     CELL_DPI,
     Identification,

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 from collections.abc import Iterator, Sequence
 
-from loopwright.pipeline.commands import COMMANDS, Parser
+from loopwright.pipeline.commands import COMMANDS, Parser, loaded
 from manual.markdown import code, table
 
 Actions = argparse._SubParsersAction
@@ -19,7 +18,7 @@ def parser_of(name: str) -> argparse.ArgumentParser:
     before = os.environ.get("LOGNAME")
     os.environ["LOGNAME"] = "you"  # a default that is the user's name
     try:
-        importlib.import_module(f"loopwright.pipeline.commands.{name}").options(parser)
+        loaded(name).options(parser)
     finally:
         if before is None:
             del os.environ["LOGNAME"]

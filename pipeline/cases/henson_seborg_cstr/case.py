@@ -9,9 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
-from loopwright.pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
+from loopwright.pipeline.evaluation.case import Case, Curve, Effort, Figure, PaperFigure, PaperTable, Requirement
 from loopwright.pipeline.evaluation.closed_loop import overshoots
-from loopwright.pipeline.evaluation.effort import Effort
 from loopwright.pipeline.evaluation.metric import Metric
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.simulator import Array

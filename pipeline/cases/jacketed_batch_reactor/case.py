@@ -11,8 +11,7 @@ import numpy as np
 
 from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import FuzzyBatchReactor
 from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
-from loopwright.pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement, Setting
-from loopwright.pipeline.evaluation.effort import Effort
+from loopwright.pipeline.evaluation.case import Array, Case, Curve, Effort, Figure, Requirement, Setting
 from loopwright.pipeline.evaluation.metric import Metric
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.simulation.scenario import Scenario, random_levels, stepwise

@@ -9,9 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopwright.pipeline.cases.reversible_cstr.plant import ReversibleCstr
-from loopwright.pipeline.evaluation.case import Array, Case, Curve, Figure, Requirement
+from loopwright.pipeline.evaluation.case import Array, Case, Curve, Effort, Figure, Requirement
 from loopwright.pipeline.evaluation.closed_loop import itae
-from loopwright.pipeline.evaluation.effort import Effort
 from loopwright.pipeline.evaluation.metric import Metric
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise

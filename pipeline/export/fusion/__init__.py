@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import onnx
 
-from loopwright.pipeline.export.fusion.choice import choose
+from loopwright.pipeline.export.fusion.choice import choose, postpone
 from loopwright.pipeline.export.fusion.emission import Outputs, emitted
 from loopwright.pipeline.export.fusion.forms import forms_of
 from loopwright.pipeline.export.fusion.items import Items
 from loopwright.pipeline.export.fusion.joining import joined
 from loopwright.pipeline.export.fusion.plan import Item
-from loopwright.pipeline.export.fusion.postponing import postpone
 from loopwright.pipeline.export.fusion.reading import Reading
 
 LEAST_SHARE = 0.002

@@ -11,10 +11,20 @@ from math import prod
 
 import numpy as np
 
-from loopwright.pipeline.export.fusion.affine import DENSE, Affine, Array, Shape, numbers, places_of
+from loopwright.pipeline.export.fusion.affine import (
+    DENSE,
+    Affine,
+    Array,
+    Operand,
+    Origin,
+    Shape,
+    Value,
+    numbers,
+    picked,
+    places_of,
+)
 from loopwright.pipeline.export.fusion.items import Items
 from loopwright.pipeline.export.fusion.plan import Input, Item
-from loopwright.pipeline.export.fusion.values import Operand, Origin, Value, picked
 
 TERMS = 3  # blocks of an elementwise form at most
 RUNS = 8  # pieces of a value put together from runs at most

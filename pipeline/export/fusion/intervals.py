@@ -8,8 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from loopwright.pipeline.export.fusion.affine import Array
-from loopwright.pipeline.export.fusion.values import Block, Operand, Value
+from loopwright.pipeline.export.fusion.affine import Array, Block, Operand, Value
 
 Interval: TypeAlias = tuple[float, float]
 ALL: Interval = (-inf, inf)

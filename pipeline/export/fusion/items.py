@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.pipeline.export.fusion.affine import Attributes, Shape
+from loopwright.pipeline.export.fusion.affine import Attributes, Block, Operand, Shape, Value, picked, whole
 from loopwright.pipeline.export.fusion.plan import Choice, Given, Input, Item, Member, Output, Several, Step
 from loopwright.pipeline.export.fusion.pools import Group, Selection  # fmt: skip
 from loopwright.pipeline.export.fusion.reading import Reading
-from loopwright.pipeline.export.fusion.values import Block, Operand, Value, picked, whole
 
 INT64 = 7
 

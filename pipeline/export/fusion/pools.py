@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import prod
 
-from loopwright.pipeline.export.fusion.affine import Shape
-from loopwright.pipeline.export.fusion.plan import Item, Member, Pool
-from loopwright.pipeline.export.fusion.prices import FIXED, INPUT, OUTPUT, product
-from loopwright.pipeline.export.fusion.values import Block, Value
+from loopwright.pipeline.export.fusion.affine import Block, Shape, Value
+from loopwright.pipeline.export.fusion.plan import FIXED, INPUT, OUTPUT, Item, Member, Pool, product
 
 
 class Selection(Pool):

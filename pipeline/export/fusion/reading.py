@@ -10,9 +10,21 @@ import onnx
 from onnx import helper, numpy_helper
 
 from loopwright.pipeline.export.fusion import intervals, reading
-from loopwright.pipeline.export.fusion.affine import DENSE, Affine, Array, Attributes, Shape, applied, numbers
-from loopwright.pipeline.export.fusion.prices import OUTPUT, price
-from loopwright.pipeline.export.fusion.values import Block, Operand, Origin, Value, whole
+from loopwright.pipeline.export.fusion.affine import (
+    DENSE,
+    Affine,
+    Array,
+    Attributes,
+    Block,
+    Operand,
+    Origin,
+    Shape,
+    Value,
+    applied,
+    numbers,
+    whole,
+)
+from loopwright.pipeline.export.fusion.plan import OUTPUT, price
 from loopwright.serving.graph.audit import graph_values
 from loopwright.serving.graph.onnx_bytes import read_model
 

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.actuator import never_given, stood_still
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, hold_numbers, require_single_loop
-from loopwright.pipeline.laws.stuck_actuator import never_given, stood_still
 from loopwright.pipeline.models.local.local_models import LocalModels
 from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.signals import Signals

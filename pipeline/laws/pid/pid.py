@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.actuator import Rates, never_given, stood_still
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
 from loopwright.pipeline.laws.pid.tuned import by_simulation, given_pairs, linearization, require_numbers, tuned
-from loopwright.pipeline.laws.rate_limits import Rates
-from loopwright.pipeline.laws.stuck_actuator import never_given, stood_still
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.equations import equations
 from loopwright.pipeline.plants.signals import Signals

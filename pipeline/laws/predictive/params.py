@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.laws.actuator import Rates
 from loopwright.pipeline.laws.predictive.disturbance_model import Where
-from loopwright.pipeline.laws.rate_limits import Rates
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Array

@@ -1,3 +1,0 @@
-"""Faults of a signal of a served plant."""
-
-FAULTS = ("", "bad", "uncertain", "frozen", "text", "deleted", "int", "nan")  # "": nothing
