@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.evaluation.case import Array
+from loopwright.pipeline.evaluation.one_side import AWAY, BEYOND
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
@@ -140,6 +141,27 @@ class Reach:
                 rests &= held is not None
                 levels[k] = self._begin(plant) if held is None else held
         return np.repeat(np.clip(levels, self.cv[0], self.cv[2]), self.hold, axis=0), rests
+
+    def stays(self, plant: IdentifiedPlant, p: Array) -> bool:
+        """Whether a plant with the parameters p (n_p,) stays where it answers to, under each MV at its ends.
+
+        An error of the gain takes a model beyond its record, where it may run away from what it had reached. It may go
+        on by ``AWAY`` of the visited range, and ``BEYOND`` times as far as without the errors: a slow one does.
+        """
+        span = self.cv[2] - self.cv[0]
+        further, usual = (self._goes_on(plant, of) for of in (p, plant.parameters()))
+        return bool(np.all(further <= np.maximum(AWAY * span, BEYOND * usual)))
+
+    def _goes_on(self, plant: IdentifiedPlant, p: Array) -> Array:
+        """How far the CVs (n_cv,) move at most after their answers to each MV at an end of its range."""
+        x, mv = plant.start
+        ends = [np.where(np.eye(len(mv), dtype=bool), [getattr(s, end) for s in plant.mv_signals], mv)
+                for end in ("low", "high")]  # fmt: skip
+        mvs = np.vstack(ends)
+        answer = RESTING if plant.foreseen is None else plant.foreseen + plant.most_dead_time
+        known = courses(plant, x, mvs, answer, p)[:, -1]
+        moved = np.abs(plant.measured(settled(plant, x, mvs, p)) - known)
+        return np.asarray(moved[:, : self.cv.shape[1]].max(axis=0))
 
     def _begin(self, plant: Simulator) -> Array:
         """CVs (n_cv,) where a plant starts, within the visited range."""

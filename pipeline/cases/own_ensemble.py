@@ -23,7 +23,7 @@ from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.records.set_points import SetPoints
-from loopwright.pipeline.simulation.rests import courses
+from loopwright.pipeline.simulation.rests import courses, settled
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
@@ -143,15 +143,20 @@ class OwnEnsemble(Case):
             return found
         (mv,) = found.mv
         values = np.linspace(mv.low, mv.high, CURVE)
-        curves = [self._curve(path, values) for path in (self._law_file, *sorted(self.models.glob(MEMBERS)))]
-        return before_turns(found, values, np.array(curves), (float(max(low, mv.low)), float(min(high, mv.high))))
+        curves = [self._curves(path, values) for path in (self._law_file, *sorted(self.models.glob(MEMBERS)))]
+        reached, rests = np.stack(curves, axis=1)
+        visited = float(max(low, mv.low)), float(min(high, mv.high))
+        return before_turns(found, values, reached, visited, rests)
 
-    def _curve(self, path: Path, values: Array) -> Array:
-        """The CV (n,) that a model reaches from its rest, as far as the answer is known, under MVs (n,)."""
+    def _curves(self, path: Path, values: Array) -> Array:
+        """The CV (2, n) that a model reaches from its rest under MVs (n,): when its answer is known, and in the end."""
         plant = self._over(self.signals, path, visited_mv(self.record, self.signals.mv)[1])
-        (signal,), ends = plant.sp_signals, courses(plant, plant.start[0], values[:, None], plant.foreseen)[:, -1, 0]
+        (signal,), (start, _) = plant.sp_signals, plant.start
+        known = courses(plant, start, values[:, None], plant.foreseen)[:, -1, 0]
+        rests = plant.measured(settled(plant, start, values[:, None]))[:, 0]
         span = signal.high - signal.low
-        return np.asarray(np.clip(ends, signal.low - span, signal.high + span))  # no record knows of curves out there
+        # No record knows of curves out there.
+        return np.asarray(np.clip([known, rests], signal.low - span, signal.high + span))
 
     @property
     def same_row(self) -> bool:

@@ -162,7 +162,8 @@ class OwnCase(OwnEnsemble):
         if less:
             count = sum(share < 1 for _, share in spoilt)
             title += (
-                f"; in {count} of {len(pairs)}, where no control gets to the set points, by {_shares(less)} of that"
+                f"; in {count} of {len(pairs)}, where no control gets to the set points or the model runs away, by "
+                f"{_shares(less)} of that"
             )
         return {
             "held_out": self._held_out,
@@ -175,8 +176,8 @@ class OwnCase(OwnEnsemble):
     def _spoilt(self, plant: OwnPlant, seed: int, errors: Mapping[str, float]) -> tuple[Scenario, float]:
         """The test on a plant gone wrong, and the share of the errors: the largest that can be controlled.
 
-        The plant then rests at each set point, and a control that knows it gets there in each hold. Where it does
-        so with none of ``SHARES`` the errors are not to blame, and stay whole.
+        The plant then rests at each set point, does not run away under an MV at its end, and a control that knows it
+        gets there in each hold. Where it does so with none of ``SHARES`` the errors are not to blame, and stay whole.
         """
         whole: Scenario | None = None
         for share in SHARES:
@@ -184,7 +185,7 @@ class OwnCase(OwnEnsemble):
             sp, rests = self.reach.drawn(plant, seed, plant.parameters(of))
             test = self._test("spoilt", "", sp, plant, seed, of)
             whole = whole or test
-            if rests and gets_there(plant, test):
+            if rests and self.reach.stays(plant, plant.parameters(of)) and gets_there(plant, test):
                 return test, share
         assert whole is not None
         return whole, 1.0

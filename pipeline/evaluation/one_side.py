@@ -11,12 +11,16 @@ from itertools import takewhile
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Array
 
 LEAST = 0.1  # of the range that may be commanded, that a side must leave
 TURNS = 0.02  # of a curve's way, by which it comes back behind its turn: less is a curve that has become flat
+
+AWAY, BEYOND = 0.1, 3.0
+"""Way that a model goes on after its answer, of its whole curve's and over that in the visited part: it is not slow."""
 
 Regions = Sequence[Mapping[str, Any]]
 
@@ -37,19 +41,26 @@ def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Si
     return _within(signals, low, high)
 
 
-def before_turns(signals: Signals, values: Array, curves: Array, visited: tuple[float, float]) -> Signals:
-    """The signals of a plant of one MV, whose range ends where a model of the record has its first turn.
+def before_turns(
+    signals: Signals, values: Array, curves: Array, visited: tuple[float, float], rests: Array | None = None
+) -> Signals:
+    """The signals of a plant of one MV, whose range ends where a model of the record turns first, or does not rest.
 
-    ``curves`` (models, n) are what the models' CV reaches under rising values (n,) of the MV. The ``visited`` part
-    (lowest, highest) remains: there the record judges, see ``on_one_side``. Outside of it nobody knows whether the turn
-    is the plant's, but a law on that model locks up behind it.
+    ``curves`` (models, n) are what the models' CV reaches under rising values (n,) of the MV as far as the answer is
+    known, ``rests`` (models, n) long after (None: the same). The ``visited`` part (lowest, highest) remains: there the
+    record judges, see ``on_one_side``. Outside of it nobody knows whether the turn is the plant's, but a law on that
+    model locks up behind it; and so it does where the model leaves what it had reached.
     """
     mv, (first, middle, last) = signals.mv[0], np.searchsorted(values, [visited[0], 0.5 * sum(visited), visited[1]])
     first, last = max(min(first, middle - 1), 0), min(max(last, middle + 1), len(values) - 1)
     rising = curves * np.sign(curves[:, [last]] - curves[:, [first]])
-    least = TURNS * np.ptp(curves, axis=1)
-    low = max([mv.low, *(values[middle - back] for back in _turns(-rising[:, middle::-1], least))])
-    high = min([mv.high, *(values[middle + on] for on in _turns(rising[:, middle:], least))])
+    way = np.ptp(curves, axis=1)
+    on = np.zeros(curves.shape) if rests is None else np.abs(rests - curves)
+    away = on > np.maximum(AWAY * way, BEYOND * on[:, first : last + 1].max(axis=1))[:, None]
+    below = [*_turns(-rising[:, middle::-1], TURNS * way), *_ends(away[:, middle::-1])]
+    above = [*_turns(rising[:, middle:], TURNS * way), *_ends(away[:, middle:])]
+    low = max([mv.low, *(values[middle - back] for back in below)])
+    high = min([mv.high, *(values[middle + ahead] for ahead in above)])
     return _within(signals, min(float(low), visited[0]), max(float(high), visited[1]))
 
 
@@ -61,6 +72,11 @@ def _turns(rising: Array, least: Array) -> list[int]:
         if lost.any():
             found.append(int(curve[: lost.argmax()].argmax()))
     return found
+
+
+def _ends(away: NDArray[np.bool_]) -> list[int]:
+    """The last places before the first that is away, of the rows (models, n) that have one."""
+    return [max(int(row.argmax()) - 1, 0) for row in away if row.any()]
 
 
 def _within(signals: Signals, low: float, high: float) -> Signals:

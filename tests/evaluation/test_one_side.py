@@ -87,3 +87,20 @@ def test_an_mv_ends_at_the_first_turn_of_a_model_and_keeps_what_was_visited() ->
         found = before_turns(ONE, u, np.array([flat]), visited).mv[0]
         assert (found.low, found.high) == ends
     assert before_turns(ONE, u, np.array([hill]), (50.2, 50.2)).mv[0].high == 70.0  # an MV that rested
+
+
+def test_an_mv_ends_where_a_model_leaves_what_it_had_reached() -> None:
+    """It answers, and then goes on by a third of its way; a slow one goes on too, a little more with each step."""
+    u = np.linspace(0.0, 100.0, 101)
+    falls, slow = 100.0 - u, 100.0 - 1.06 * u
+    runs = falls + 40.0 * (u < 8.0)
+    for rests, ends in [
+        ([falls, runs], (8.0, 100.0)),
+        ([falls, falls - 40.0 * (u > 88.0)], (0.0, 88.0)),
+        ([falls, slow], (0.0, 100.0)),
+        ([falls, runs + 20.0], (0.0, 100.0)),  # it does so where the record judges, too
+    ]:
+        found = before_turns(ONE, u, np.array([falls, falls]), (30.0, 60.0), np.array(rests)).mv[0]
+        assert (found.low, found.high) == ends
+    visited = before_turns(ONE, u, np.array([falls]), (5.0, 60.0), np.array([runs])).mv[0]
+    assert visited.low <= 5.0
