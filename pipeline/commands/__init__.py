@@ -49,7 +49,7 @@ MODULES = {"loop": "loopwright.serving.station.command", **OF_THE_RUNTIME}
 
 
 class Command(NamedTuple):
-    """What a command takes, and what does it: the exit status, None for 0."""
+    """The options of a command, and the function that does it and gives the exit status (None: 0)."""
 
     options: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int | None]

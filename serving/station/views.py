@@ -32,8 +32,8 @@ PICTURES = ("{stem}.png", "figures/closed_loop_{stem}.png")
 class Snapshot:
     """The loop as a scan left it.
 
-    The loop's own thread makes one after each scan. Who answers others reads nothing else of the loop and its monitor,
-    so that no answer is half of one scan and half of the next.
+    The loop's own thread makes one after each scan. Answers to others are made of it, and of nothing else of the loop
+    and its monitor, so that none is half of one scan and half of the next.
     """
 
     seen_s: float  # since 1970
