@@ -18,6 +18,8 @@ RANK = 1e-8  # singular values of the Hankel matrix below this share of the larg
 NOTHING = 1e-14  # a largest one below this share of |C| |B| is nothing at all
 DIFFERENCE = 1e-4  # of a signal's size: the step of the central differences
 ANSWERED = 1e-6  # of its largest move in a period: the CV has begun to answer
+OVERSHOOT = 0.02  # of its end, by which an answer swings beyond it: no lags do
+LONGEST_ANSWER = 20  # mean residence times in which an answer ends
 REST = 1e-6  # of a state's size: what the start may move in one period and count as at rest
 
 
@@ -104,14 +106,18 @@ class LagWithDeadTime:
 def start_lags(plant: Simulator) -> tuple[Linearization, float]:
     """One or two lags, and a dead time [s] before them, that resemble the plant near its start, first MV to CV.
 
-        r(k) = 1 - y(k)/K,   T = h sum_k r(k) - h/2,   S = 2 h^2 sum_k k r(k) - T^2
-        G(s) = K exp(-theta s) / ((t1 s + 1) (t2 s + 1)),   t1 + t2 = T - theta,   t1^2 + t2^2 = S
+        r(k) = 1 - y(k)/K,   T = h sum_k r(k) - h/2,   S = 2 h^2 sum_k k r(k) - T^2,
+        C = 3 h^3 sum_k k^2 r(k) - 3 T S - T^3
+        G(s) = K exp(-theta s) / ((t1 s + 1) (t2 s + 1)),   t1 + t2 = T - theta,   t1^2 + t2^2 = S,   t1^3 + t2^3 = C/2
 
     y is the response to a unit step of the MV, K its end, h the period; it follows from central differences of
-    ``step`` and ``measure``. T and S are the mean and the variance of the residence times. theta is the time in which
-    the CV does not answer at all; more where S is too small for two lags after it (a chain of lags), which are then
-    equal. Where the smaller lag would be below h/2, there is one lag. Raises PlantError where the start is not at rest
-    or not stable, or the CV does not follow the MV.
+    ``step`` and ``measure``. T, S and C are the first three cumulants of the residence times: the first two do not
+    tell a dead time from a lag. Where C is too small for two lags (a chain of them), they are equal; theta is at least
+    the time in which the CV does not answer at all, and no more where its answer overshoots, as no lags do. Where the
+    smaller lag would be below h/2, there is one lag. Raises PlantError where the start is not at rest or not stable,
+    or the CV does not follow the MV.
+
+    Source: Astrom and Hagglund, Advanced PID Control, section 2.4 (method of moments), with one moment more.
     """
     x0, mv0 = (np.asarray(v, dtype=np.float64) for v in plant.start)
     dv, p, h = plant.dv_nominal, plant.parameters(), plant.period_s
@@ -142,13 +148,21 @@ def start_lags(plant: Simulator) -> tuple[Linearization, float]:
             f"plant {plant.name!r} is no lag at its start: gain {gain:.3g}, mean residence time {time_s:.3g} s; "
             f"{remedy}"
         )
-    variance = max(0.0, 2 * h**2 * float(c @ phi @ ends @ ends @ rest) / gain - time_s**2)
-    answers = [abs(float(c @ np.linalg.matrix_power(phi, k) @ gamma)) for k in range(len(phi))]
-    silent = int((np.array(answers) > ANSWERED * max(answers)).argmax())
-    dead_s = max(h * silent, time_s - float(np.sqrt(2 * variance)))
+    second = c @ phi @ ends @ ends @ rest / gain  # sum_k k r(k)
+    third = 2 * c @ phi @ phi @ ends @ ends @ ends @ rest / gain + second  # sum_k k^2 r(k)
+    variance = max(0.0, 2 * h**2 * float(second) - time_s**2)
+    skew = 3 * h**3 * float(third) - 3 * time_s * variance - time_s**3
+    answers, state = [], gamma
+    for _ in range(max(len(phi), int(LONGEST_ANSWER * time_s / h) + 1)):
+        answers.append(float(c @ state))
+        state = phi @ state
+    silent = int((np.abs(answers) > ANSWERED * np.abs(answers).max()).argmax())
+    dead_s, seen_s = h * silent, time_s - _sum_of_two(variance, skew)
+    # Less than half a period more is the sampling, or the error of a difference.
+    if seen_s > dead_s + h / 2 and not (np.cumsum(answers) / gain).max() > 1 + OVERSHOOT:
+        dead_s = seen_s
+    dead_s = min(dead_s, max(time_s - h / 2, 0.0))  # of a dead time alone, the lag is that of a held MV
     left_s = time_s - dead_s
-    if not left_s >= h / 2:  # a dead time alone: the lag is that of a held MV
-        dead_s, left_s = time_s - h / 2, h / 2
     apart = np.sqrt(max(0.0, variance / 2 - left_s**2 / 4))
     slow, fast = left_s / 2 + apart, left_s / 2 - apart
     if fast < h / 2:
@@ -156,6 +170,17 @@ def start_lags(plant: Simulator) -> tuple[Linearization, float]:
         return Linearization(np.zeros(1), mv0[:1], -rate, gain * rate, np.eye(1)), dead_s
     a, b = np.array([[-1 / slow, 0.0], [1 / fast, -1 / fast]]), np.array([[gain / slow], [0.0]])
     return Linearization(np.zeros(2), mv0[:1], a, b, np.array([[0.0, 1.0]])), dead_s
+
+
+def _sum_of_two(squares: float, twice_cubes: float) -> float:
+    """t1 + t2 of the lags whose squares and, twice, whose cubes have these sums; of equal or one lag where none have.
+
+    With s = (t1 + t2)/sqrt(t1^2 + t2^2), s^3 - 3 s + 2 c = 0 and c = (t1^3 + t2^3)/(t1^2 + t2^2)^1.5, 1/sqrt 2 to 1.
+    """
+    if not squares > 0:
+        return 0.0
+    cubes = float(np.clip(twice_cubes / (2 * squares**1.5), np.sqrt(0.5), 1.0))
+    return float(np.sqrt(squares) * 2 * np.cos(np.arccos(-cubes) / 3))
 
 
 def _slope(f: Callable[[Array], Array], at: Array, by: Array, low: ArrayLike = -inf, high: ArrayLike = inf) -> Array:

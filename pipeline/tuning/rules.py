@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import ceil, inf
+from math import floor, inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.tuning.reduction import LagWithDeadTime, minimal
 
 LONGEST_FILTER = 40.0  # periods; an IMC filter is looked for between half a period and this
+ROUNDING = 1e-9  # of a period: no part of a dead time
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +223,8 @@ def itae_pid(process: LagWithDeadTime, period_s: float, sampling: float = 0.5) -
     if not 0 < 0.147 * ratio < 0.796:
         raise LawError(
             f"the ITAE rule is for dead times above 0 and up to the time constant ({tau:.3g} s); here {theta:.3g} s, "
-            f"of it {sampling * period_s:.3g} s for the sampling: take another period or tuning `optimized`"
+            f"of it {sampling * period_s:.3g} s for the sampling: take another period, or tuning `imc`, `simc` or "
+            "`optimized`"
         )
     return PidSettings(
         kc=0.965 / process.gain * ratio**-0.855,
@@ -231,43 +233,64 @@ def itae_pid(process: LagWithDeadTime, period_s: float, sampling: float = 0.5) -
     )
 
 
-def sampled_loop(lin: Linearization, settings: PidSettings, period_s: float, late: int = 0) -> Array:
+def sampled_loop(lin: Linearization, settings: PidSettings, period_s: float, late: float = 0.0) -> Array:
     """The matrix that takes [dx, mv, y, d, earlier mv] of the sampled closed loop one period on, set point at rest.
 
-    ``late``: periods of dead time before the plant, of which so many earlier MVs are kept, the latest first. The loop
-    is stable where all eigenvalues lie inside the unit circle.
+    ``late``: periods of dead time before the plant, whole or not, for which so many earlier MVs are kept, the latest
+    first. The loop is stable where all eigenvalues lie inside the unit circle.
     """
+    whole, part, kept = _periods(late)
     phi, gamma = lin.sampled(period_s)
     n, h, s = len(phi), period_s, settings
     columns = []
-    for state in np.eye(n + 3 + late):
+    for state in np.eye(n + 3 + kept):
         x, mv, y1, d1, line = state[:n], state[n], state[n + 1], state[n + 2], state[n + 3 :]
         y = float(lin.c[0] @ x)
         d = (s.filter_s * d1 + s.td_s * (y - y1)) / (s.filter_s + h)
         mv = mv + s.kc * (-(y - y1) - h / s.ti_s * y - (d - d1))
         line = np.concatenate([[mv], line])
-        columns.append(np.concatenate([phi @ x + gamma[:, 0] * line[-1], [mv, y, d], line[:late]]))
+        acting = line[whole] if not part else (1 - part) * line[whole] + part * line[whole + 1]
+        columns.append(np.concatenate([phi @ x + gamma[:, 0] * acting, [mv, y, d], line[:kept]]))
     return np.array(columns).T
 
 
-def peak_sensitivity(lin: Linearization, settings: PidSettings, period_s: float, late: int = 0) -> float:
+def _periods(late: float) -> tuple[int, float, int]:
+    """(whole periods of a dead time, the part of one beyond them, earlier MVs that they need); rounding is no part."""
+    whole = floor(late + ROUNDING)
+    part = max(0.0, late - whole)
+    part = 0.0 if part < ROUNDING else part
+    return whole, part, whole + bool(part)
+
+
+def peak_sensitivity(lin: Linearization, settings: PidSettings, period_s: float, late: float = 0.0) -> float:
     """Largest |1/(1 + C G)| of the sampled loop over frequency; infinite where the loop is unstable.
 
     1/peak is the distance of the loop's Nyquist curve from -1: 1.4 is cautious, 2 is tight. ``late``: as for
     ``sampled_loop``.
     """
-    if np.abs(np.linalg.eigvals(sampled_loop(lin, settings, period_s, late))).max() >= 1:
-        return float("inf")
-    phi, gamma = lin.sampled(period_s)
+    if not _settles(lin, settings, period_s, late):
+        return inf
+    return float(_peaks(lin, [settings], period_s, late)[0])
+
+
+def _settles(lin: Linearization, settings: PidSettings, period_s: float, late: float) -> bool:
+    return bool(np.abs(np.linalg.eigvals(sampled_loop(lin, settings, period_s, late))).max() < 1)
+
+
+def _peaks(lin: Linearization, tried: Sequence[PidSettings], period_s: float, late: float) -> Array:
+    """Largest |1/(1 + C G)| over frequency of each loop (n,), as if all were stable."""
+    (phi, gamma), (whole, part, _) = lin.sampled(period_s), _periods(late)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 400))
     resolvent = np.linalg.solve(
         z[:, None, None] * np.eye(len(phi)) - phi, np.broadcast_to(gamma, (len(z), *gamma.shape))
     )
-    g = (lin.c[0] @ resolvent)[:, 0] * z**-late
-    s, back = settings, 1 - 1 / z
-    derivative = s.td_s * back / (s.filter_s * back + period_s)
-    loop = s.kc * (1 + period_s / s.ti_s / back + derivative) * g
-    return float(np.abs(1 / (1 + loop)).max())
+    g, back = (lin.c[0] @ resolvent)[:, 0] * (z**-whole * (1 - part + part / z)), 1 - 1 / z
+    found = []
+    for s in tried:
+        derivative = s.td_s * back / (s.filter_s * back + period_s)
+        loop = s.kc * (1 + period_s / s.ti_s / back + derivative) * g
+        found.append(np.abs(1 / (1 + loop)).max())
+    return np.array(found)
 
 
 def longest_filter(process: AllPole | LagWithDeadTime, period_s: float) -> float:
@@ -278,20 +301,22 @@ def longest_filter(process: AllPole | LagWithDeadTime, period_s: float) -> float
 def robust_imc(lin: Linearization, period_s: float, peak: float = 2.0, *, dead_time_s: float = 0.0) -> PidSettings:
     """IMC with the shortest filter whose sampled loop keeps its peak sensitivity at ``peak`` or below.
 
-    ``dead_time_s``: before the plant; the sampled loop has the next larger number of whole periods. Where no filter
-    does, the one with the smallest peak. Raises LawError where no filter stabilizes.
+    ``dead_time_s``: before the plant. Where no filter does, the one with the smallest peak. Raises LawError where no
+    filter stabilizes.
     """
     process, lin = AllPole.of(lin, dead_time_s=dead_time_s), minimal(lin)
-    late, longest = ceil(dead_time_s / period_s - 1e-9), longest_filter(process, period_s)
+    late, longest = dead_time_s / period_s, longest_filter(process, period_s)
     tried = [imc_pid(process, float(v)) for v in np.geomspace(0.5, longest, 90) * period_s]
-    peaks = np.array([peak_sensitivity(lin, s, period_s, late) for s in tried])
-    if np.isinf(peaks).all():
-        raise LawError(
-            f"no IMC filter from {0.5 * period_s:g} to {longest * period_s:g} s stabilizes the sampled loop; "
-            "shorten the period or tune by hand (`manual`)"
-        )
-    good = np.nonzero(peaks <= peak)[0]
-    return tried[int(good[0]) if good.size else int(peaks.argmin())]
+    peaks = _peaks(lin, tried, period_s, late)
+    # Eigenvalues cost the cube of a dead time: only those are asked that can be the first.
+    later = [i for i in peaks.argsort(kind="stable").tolist() if peaks[i] > peak]
+    for i in (*np.flatnonzero(peaks <= peak).tolist(), *later):
+        if _settles(lin, tried[i], period_s, late):
+            return tried[i]
+    raise LawError(
+        f"no IMC filter from {0.5 * period_s:g} to {longest * period_s:g} s stabilizes the sampled loop; "
+        "shorten the period or tune by hand (`manual`)"
+    )
 
 
 def optimized_imc(

@@ -205,6 +205,54 @@ class TwoLags(Piped):
     lags = 2
 
 
+class Cells(Piped):
+    """Five cells of 4.8 s in the pipe's place, whose outflow shows a little at once."""
+
+    pipe, lags = 0, 6
+
+    def step(self, x: np.ndarray, mv: np.ndarray, dv: np.ndarray, p: np.ndarray) -> np.ndarray:
+        keep = np.exp(-self.period_s / np.array([4.8] * 5 + [60.0]))
+        return keep * x + (1 - keep) * np.concatenate([2 * mv, x[:-1]])
+
+
+class Leaking(Piped):
+    """A hundred-thousandth of the MV goes past the pipe."""
+
+    def step(self, x: np.ndarray, mv: np.ndarray, dv: np.ndarray, p: np.ndarray) -> np.ndarray:
+        after = super().step(x, mv, dv, p)
+        return np.concatenate([after[:-1], after[-1:] + 1e-5 * mv])
+
+
+class Against(Piped):
+    """Gain -2, a dead time of two samples and a half."""
+
+    pipe = 3
+
+    def step(self, x: np.ndarray, mv: np.ndarray, dv: np.ndarray, p: np.ndarray) -> np.ndarray:
+        into, keep = -(x[1] + x[2]), np.exp(-self.period_s / self.tau_s)
+        return np.concatenate([mv, x[:2], keep * x[3:] + (1 - keep) * into])
+
+
+class PipeAlone(Piped):
+    """Twenty samples, and no lag to speak of."""
+
+    pipe, tau_s = 20, 0.1
+
+
+class Swinging(Piped):
+    """A swing of 10 rad/s per 100 s with half of the critical damping, and no dead time."""
+
+    pipe, lags, period_s, damping = 0, 2, 1.0, 0.5
+
+    def step(self, x: np.ndarray, mv: np.ndarray, dv: np.ndarray, p: np.ndarray) -> np.ndarray:
+        for _ in range(100):
+            x = x + 0.01 * np.array([x[1], 0.01 * (mv[0] - x[0]) - 0.2 * self.damping * x[1]])
+        return x
+
+    def measure(self, x: np.ndarray) -> np.ndarray:
+        return x[:1]
+
+
 def test_a_dead_time_is_no_lag() -> None:
     """A pipe of 12 samples of 2 s; a lag that is sampled counts half a period less."""
     lag, dead_s = start_lags(Piped())
@@ -216,10 +264,34 @@ def test_a_dead_time_is_no_lag() -> None:
     lags, dead_s = start_lags(Chain())
     assert (-1 / lags.eigenvalues.real).sum() + dead_s == pytest.approx(300.0, rel=0.03)
     assert dead_s > 60.0
+    for plant, wanted in ((Leaking(), 24.0), (Against(), 5.0), (PipeAlone(), 40.0)):
+        lag, dead_s = start_lags(plant)
+        assert dead_s == pytest.approx(wanted, abs=1.1)
+        assert len(lag.eigenvalues) == 1
+    lags, dead_s = start_lags(Cells())
+    assert max(-1 / lags.eigenvalues.real) == pytest.approx(60.0, rel=0.02)
+    assert 15.0 < dead_s < 24.0
+
+
+def test_what_has_no_dead_time_gets_none() -> None:
+    """Neither by sampling or a difference's error, nor because it swings or overshoots at once."""
+    for plant in (OneTank(), Swinging()):
+        assert start_lags(plant)[1] == 0.0
+
+
+@pytest.mark.parametrize("tuning", ["imc", "simc"])
+@pytest.mark.parametrize("plant", [PipeAlone(), Swinging()], ids=lambda p: type(p).__name__)
+def test_a_rules_pid_settles_what_is_no_lag(plant: Simulator, tuning: str) -> None:
+    law = PID.design(PID.Params(tuning=tuning), {}, plant.signals, plant)
+    loop = simulate_closed(plant, stepper(law), Scenario("step", "", held([1.0], 600), *plant.start))
+    assert loop.pv[-1, 0] == pytest.approx(1.0, abs=0.02)
+    assert loop.pv.max() < 1.5
 
 
 @pytest.mark.parametrize("tuning", ["imc", "simc", "itae"])
-@pytest.mark.parametrize("plant", [Piped(), TwoLags(), Chain()], ids=lambda p: type(p).__name__)
+@pytest.mark.parametrize(
+    "plant", [Piped(), TwoLags(), Chain(), Cells(), Leaking(), Against()], ids=lambda p: type(p).__name__
+)
 def test_a_rules_pid_settles_a_plant_with_dead_time(plant: Simulator, tuning: str) -> None:
     """Within twenty lags, without more than a few swings: the MV travels little more than its change."""
     law = PID.design(PID.Params(tuning=tuning), {}, plant.signals, plant)

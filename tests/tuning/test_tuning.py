@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -285,3 +288,31 @@ def test_a_plant_that_no_lag_resembles_is_taken_with_dead_time() -> None:
     assert isinstance(found, LagWithDeadTime)
     assert (found.gain, found.tau_s) == (pytest.approx(2.0), pytest.approx(tau * np.sqrt(n)))
     assert found.dead_time_s == pytest.approx(n * tau - tau * np.sqrt(n))
+
+
+@pytest.mark.parametrize("late", [0.0, 1.0, 3.0, 2.4])
+def test_a_loop_with_dead_time_is_that_of_the_plant_with_a_shift_register(late: float) -> None:
+    """Each sample of dead time is a state of a sampled plant; a part of one blends two of them."""
+    lin, s = first_order(2.0, 10.0), PidSettings(0.8, 9.0, 0.5, filter_s=0.2)
+    whole, part = int(late), late - int(late)
+    phi, gamma = lin.sampled(1.0)
+    n = 1 + whole + 1
+    a, b = np.zeros((n, n)), np.zeros((n, 1))
+    taps = np.zeros(whole + 2)
+    taps[whole], taps[whole + 1] = 1 - part, part
+    a[0, 0], a[0, 1:], b[0, 0] = phi[0, 0], gamma[0, 0] * taps[1:], gamma[0, 0] * taps[0]
+    b[1, 0], a[2:, 1:-1] = 1.0, np.eye(whole)
+    shifted = SimpleNamespace(sampled=lambda _: (a, b), c=np.eye(1, n))
+    poles, wanted = (np.linalg.eigvals(m) for m in (sampled_loop(lin, s, 1.0, late), sampled_loop(shifted, s, 1.0)))
+    largest, others = (np.sort(np.abs(v))[::-1][:4] for v in (poles, wanted))
+    assert largest == pytest.approx(others, abs=1e-9)
+    assert peak_sensitivity(lin, s, 1.0, late) == pytest.approx(peak_sensitivity(shifted, s, 1.0), rel=1e-9)
+
+
+def test_a_dead_time_makes_rules_slower() -> None:
+    quick = AllPole.of(first_order(2.0, 10.0))
+    late = replace(quick, dead_time_s=3.0)
+    assert imc_pid(late, 2.0) == imc_pid(quick, 5.0)
+    assert simc_pid(late, 1.0, 2.0) == simc_pid(quick, 7.0, 2.0)
+    with pytest.raises(LawError):
+        imc_pid(replace(AllPole.of(second_order(1.0, 0.3, -0.1)), dead_time_s=1.0), 1.0)
