@@ -136,7 +136,10 @@ class OwnEnsemble(Case):
 
     @cached_property
     def commanded(self) -> Signals:
-        """The signals of the laws: the MV ends where the record proves that its gain turns, or a model of it turns."""
+        """The signals of the laws: the MV ends where its gain turns, as the record proves or a model of it says.
+
+        A model may also leave there what it had reached, see ``before_turns``.
+        """
         low, median, high = visited_mv(self.record, self.signals.mv)[:, 0]
         found = on_one_side(self.signals, self._figures.get("proof") or {}, float(median))
         if len(found.mv) != 1 or len(found.sp) != 1 or not self.ready:

@@ -56,7 +56,10 @@ def before_turns(
     rising = curves * np.sign(curves[:, [last]] - curves[:, [first]])
     way = np.ptp(curves, axis=1)
     on = np.zeros(curves.shape) if rests is None else np.abs(rests - curves)
-    away = on > np.maximum(AWAY * way, BEYOND * on[:, first : last + 1].max(axis=1))[:, None]
+    # What a slow model still has to go grows with the move.
+    half = 0.5 * (values[last] - values[first])
+    farther = np.maximum(1.0, np.abs(values - 0.5 * (values[last] + values[first])) / half)
+    away = on > np.maximum(AWAY * way[:, None], BEYOND * on[:, first : last + 1].max(axis=1)[:, None] * farther)
     below = [*_turns(-rising[:, middle::-1], TURNS * way), *_ends(away[:, middle::-1])]
     above = [*_turns(rising[:, middle:], TURNS * way), *_ends(away[:, middle:])]
     low = max([mv.low, *(values[middle - back] for back in below)])

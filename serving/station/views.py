@@ -39,7 +39,7 @@ class Snapshot:
     seen_s: float  # since 1970
     sample: Sample | None
     command: Command
-    controller: Controller  # in charge of the next scan
+    controller: Controller  # in charge after it; a change that is asked for now shows with the next scan
     stepped: Controller  # that gave this command; another one where a swap followed
     successor: View | None  # on trial
     replaced: Controller | None

@@ -102,5 +102,7 @@ def test_an_mv_ends_where_a_model_leaves_what_it_had_reached() -> None:
     ]:
         found = before_turns(ONE, u, np.array([falls, falls]), (30.0, 60.0), np.array(rests)).mv[0]
         assert (found.low, found.high) == ends
+    slow = before_turns(ONE, u, np.array([0.7 * (u - 50.0)]), (45.0, 55.0), np.array([u - 50.0])).mv[0]
+    assert (slow.low, slow.high) == (0.0, 100.0)
     visited = before_turns(ONE, u, np.array([falls]), (5.0, 60.0), np.array([runs])).mv[0]
     assert visited.low <= 5.0

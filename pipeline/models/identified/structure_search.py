@@ -120,14 +120,13 @@ def select(
     search = LinearSearch.of(rounds)
     linear = search.finish(search.first_round(orders, given, lagged))
     if _integrates(linear[0]):
-        settling = [t for t in smallest_first([*search.settling(linear), *linear]) if _stands_in(t, linear[0])]
-        linear = [*settling[:1], *(t for t in linear if t.structure != settling[0].structure)] if settling else linear
+        linear = _led_by_settling(linear, search.settling(linear))
     if correction is None and _integrates(linear[0]):
         corrected = search.corrected(linear, SLOW)
         linear = corrected if corrected and corrected[0].rank < linear[0].rank else linear
     if may_act_in_its_row(rounds.problem.part(linear[0].structure, rounds.problem.folds[0].train), rounds.problem.n_mv):
         # Both conventions stay on offer: the networks' held-out error may decide otherwise than the linear models'.
-        linear = smallest_first([*linear, *search.in_the_same_row(linear)])
+        linear = _led_by_settling(smallest_first([*linear, *search.in_the_same_row(linear)]))
     offered = linear if correction is not None else [_with_correction(t, 0.0) for t in linear]
     problem = _as_its_linear_model(rounds.problem, linear[0])
     networks = NetworkSearch(replace(rounds, problem=problem), offered)
@@ -147,7 +146,7 @@ def select(
     if drift is not None and drifting:
         # Plain free runs would rank candidates by how they follow what no model can.
         linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
-        linear = smallest_first(rounds.judged_beyond_drift(linear, drift.rows))
+        linear = _led_by_settling(smallest_first(rounds.judged_beyond_drift(linear, drift.rows)))
         finalists = rounds.judged_beyond_drift(finalists, drift.rows)
     every, spent = [*linear, *finalists], rounds.budget.spent
     return Selection(linear[0], best_of(finalists), every, spent, problem.settles, drifting, None, problem.farthest)
@@ -173,10 +172,19 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     return Selection(linear[0], best, every, spent, problem.settles, False, gained, problem.farthest, alike)
 
 
+def _led_by_settling(linear: list[Trial], more: Sequence[Trial] = ()) -> list[Trial]:
+    """The trials, where the first integrates after one of them or of ``more`` that settles and stands in for it."""
+    if not _integrates(linear[0]):
+        return linear
+    found = next((t for t in smallest_first([*more, *linear]) if _stands_in(t, linear[0])), None)
+    return linear if found is None else [found, *(t for t in linear if t.structure != found.structure)]
+
+
 def _stands_in(trial: Trial, best: Trial) -> bool:
     """Whether a trial settles in all folds and errs little more than the best, which integrates in one at least."""
     most = NEARLY if min(_slowest(best, fold) for fold in best.folds) > INTEGRATES else CONTRADICTED
-    return not _integrates(trial) and trial.against <= best.against and trial.error <= most * best.error
+    known = len(trial.fits) >= len(best.fits) and trial.against <= best.against
+    return known and not _integrates(trial) and trial.error <= most * best.error
 
 
 def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:

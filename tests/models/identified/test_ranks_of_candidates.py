@@ -20,6 +20,7 @@ from loopwright.pipeline.models.identified.scaled_record import Fold
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure, Trial
 from loopwright.pipeline.models.identified.structure_search import (
     _as_its_linear_model,
+    _led_by_settling,
     _settling_first,
     _stands_in,
     by_innovations,
@@ -95,6 +96,15 @@ def test_a_state_that_drifts_is_a_loads_where_a_model_that_settles_errs_as_littl
 )
 def test_an_integrator_shows_in_all_parts_of_an_open_record(best: Trial, other: Trial, stands_in: bool) -> None:
     assert _stands_in(other, best) is stands_in
+
+
+def test_a_trial_that_settles_leads_those_that_integrate_in_one_part_whatever_comes_to_them() -> None:
+    """Of fewer folds it says too little; of the structure that it stands in for there is one."""
+    best, settles, part = trial(1.0, 0.98, 1.003), trial(1.2, 0.9, 0.9), trial(0.9, 0.9)
+    assert _led_by_settling([best, settles]) == [settles]
+    assert _led_by_settling([best], [settles]) == [settles]
+    assert _led_by_settling([best], [part]) == [best]
+    assert _led_by_settling([settles, best]) == [settles, best]
 
 
 @dataclass
