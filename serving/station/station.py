@@ -133,7 +133,7 @@ class Station:
 
     @property
     def in_charge(self) -> Controller:
-        """The controller of the next scan."""
+        """The controller in charge after the last scan."""
         return self.controller if self.snapshot is None else self.snapshot.controller
 
     def ending(self) -> list[str]:

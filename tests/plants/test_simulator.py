@@ -240,7 +240,7 @@ class PipeAlone(Piped):
 
 
 class Swinging(Piped):
-    """A swing of 10 rad/s per 100 s with half of the critical damping, and no dead time."""
+    """A swing of 0.1 rad/s with half of the critical damping, and no dead time."""
 
     pipe, lags, period_s, damping = 0, 2, 1.0, 0.5
 
