@@ -55,11 +55,6 @@ def test_true_plant_may_drive_the_gate(pi_law: ControlLaw, pi_file: Path) -> Non
     assert np.ptp(seen) > 1
 
 
-def test_the_file_holds_the_fused_graph(pi_law: ControlLaw, pi_file: Path) -> None:
-    written, _ = law_graph(pi_law)
-    assert Controller(pi_file).summary.nodes < len(written.graph.node)
-
-
 def test_python_floats_keep_their_53_bits(make_formula: MakeFormula, tmp_path: Path) -> None:
     """The exporter alone writes 0.1 as float32, takes 1e-9 for zero and 1.0000001 for one."""
 

@@ -13,7 +13,6 @@ from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCas
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.excitation import EXCITATIONS
-from loopwright.pipeline.export.fusion import fused
 from loopwright.pipeline.export.graph import law_graph
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.laws.gain_update import gain_update
@@ -218,7 +217,7 @@ def test_an_mv_that_was_not_obeyed_is_no_windup(model: NNARX) -> None:
 )
 def test_few_operators(model: NNARX, params: dict, most: int) -> None:
     graph, _ = law_graph(ph_law(model, **params))
-    assert len(fused(graph).graph.node) <= most
+    assert len(graph.graph.node) <= most
 
 
 @pytest.mark.parametrize(
