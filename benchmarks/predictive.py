@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.export.controller_file import export
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models.identified.assembly import assembled, noise_of
 from loopwright.pipeline.models.identified.identified import Identified
@@ -29,7 +29,7 @@ from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 from loopwright.serving import Controller, Signal
-from loopwright.serving.bench import bench
+from loopwright.serving.card import bench
 
 HOLD, LEVELS = 60, 8
 

@@ -25,7 +25,7 @@ import numpy as np
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.optimal.perfect import PerfectNmpc
 from loopwright.serving import Controller, LoopwrightError
-from loopwright.serving.bench import bench
+from loopwright.serving.card import bench
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from loopwright.serving.arguments import Parser, write_any_text
-from loopwright.serving.bench import bench, table
-from loopwright.serving.card import card, card_json
+from loopwright.serving.card import bench, card, card_json, table
 from loopwright.serving.conformance.check import check
 from loopwright.serving.conformance.kit import VECTORS, write_kit
 from loopwright.serving.errors import LoopwrightError

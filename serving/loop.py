@@ -17,10 +17,9 @@ from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
 from loopwright.serving.grid import RunReport, run_on_grid
 from loopwright.serving.guard import Guard, Sample, default_guards, reworded
-from loopwright.serving.modes import Command, Fallback, LoopMode, Mode, mode_of
+from loopwright.serving.modes import ByHand, Command, Fallback, LoopMode, Mode, Transfer, mode_of
 from loopwright.serving.mv_readback import AppliedMV
 from loopwright.serving.ranges import within
-from loopwright.serving.transfer import ByHand, Transfer
 from loopwright.serving.words import first_line
 
 __all__ = ["WARM_LEAD_S", "Command", "ControlLoop", "Mode", "within"]
@@ -75,7 +74,7 @@ class ControlLoop:
         Missed periods in a row after which the law starts cold.
     transfer_s
         After a change to AUTO or of the controller, an MV crosses its range at most once in this time [s], until it
-        is where the law wants it; 0: at once. See ``loopwright.serving.transfer``.
+        is where the law wants it; 0: at once. See ``loopwright.serving.modes``.
     fallback
         What to do when a fault lasts; None: the MV stays. See ``loopwright.serving.modes``.
 

@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from types import ModuleType
 
-from loopwright.pipeline.plants.fmu.table import FmuRow, FmuTable
+from loopwright.pipeline.plants.fmu.description import FmuRow, FmuTable
 from loopwright.pipeline.plants.simulator_file import FileSimulator
 from loopwright.serving.manifest import Signal
 

@@ -9,7 +9,7 @@ import pytest
 from benchmark_modules import benchmark_script
 
 from loopwright.pipeline.cases import CASES
-from loopwright.serving.monitor import learning, monitor
+from loopwright.serving.monitor import cusum, monitor
 
 # Of a chart. Fewer than 12 that are independent make it learn four times as long, as here the 10 of the first case do:
 # after 14 blocks of it another verdict would come first.
@@ -34,8 +34,8 @@ def assert_found_and_quiet_without(name: str, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(monitor, "LEARN_RESTS", 60)
     monkeypatch.setattr(monitor, "LEARN_MODEL", 6)
     monkeypatch.setattr(monitor, "LEARN_BLOCKS", BLOCKS.get(name, 14))
-    monkeypatch.setattr(learning, "FINE_S", 0.0)
-    monkeypatch.setattr(learning, "LEARN_S", 0.0)
+    monkeypatch.setattr(cusum, "FINE_S", 0.0)
+    monkeypatch.setattr(cusum, "LEARN_S", 0.0)
     # Looking takes a quarter of the time where it is done at every scan.
     monkeypatch.setattr(benchmark_script("monitor"), "LOOK_S", 10 * CASES[name].plant.period_s)
     parameter, share, verdicts, within = DRIFTS[name]

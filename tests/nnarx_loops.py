@@ -11,7 +11,7 @@ import numpy as np
 from loopwright.pipeline.excitation import Excitation
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.models import MODELS, Model
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.signals import Signals

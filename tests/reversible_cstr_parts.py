@@ -6,7 +6,7 @@ import numpy as np
 
 from loopwright.pipeline.laws.reference.reference_loops import Training
 from loopwright.pipeline.models import Model
-from loopwright.pipeline.models.state_space.state_space import StateSpace
+from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.models.training.fit import LevenbergMarquardt
 from loopwright.pipeline.models.training.objectives import Samples
 from loopwright.pipeline.plants.equations import EquationPlant

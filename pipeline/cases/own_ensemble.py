@@ -22,7 +22,7 @@ from loopwright.pipeline.files import read_json
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
-from loopwright.pipeline.records.set_points import SetPoints
+from loopwright.pipeline.records.record_file import SetPoints
 from loopwright.pipeline.simulation.rests import courses, settled
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on

@@ -11,7 +11,7 @@ from loopwright.pipeline.cases.operating_range import SCALES, TIMES, VISITED_MV,
 from loopwright.pipeline.evaluation.case import Array
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.records.record import Record
-from loopwright.pipeline.records.set_points import stretches
+from loopwright.pipeline.records.record_file import stretches
 from loopwright.pipeline.simulation.rests import courses
 
 # --------------------------------------------------------------------------------------------------------------- loads

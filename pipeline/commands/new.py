@@ -14,9 +14,15 @@ import numpy as np
 
 from loopwright.pipeline.cases.own_entries import entries_of
 from loopwright.pipeline.commands.arguments import positive, whole
-from loopwright.pipeline.commands.own_plant.fmu_variables import table_from, write_table
 from loopwright.pipeline.commands.own_plant.from_export import asked, given_tags, loop_lines, propose_tags
-from loopwright.pipeline.commands.own_plant.from_simulator import Simulated, copy_name, keep, simulated
+from loopwright.pipeline.commands.own_plant.from_simulator import (
+    Simulated,
+    copy_name,
+    keep,
+    simulated,
+    table_from,
+    write_table,
+)
 from loopwright.pipeline.commands.own_plant.known_pairs import signals_as_tags, stated_of
 from loopwright.pipeline.commands.own_plant.mv_limits import check_commands, check_start, commanded, confirmed, mvs_of
 from loopwright.pipeline.commands.own_plant.printed import tell
@@ -27,10 +33,9 @@ from loopwright.pipeline.commands.own_plant.replaced import (
     limits_kept,
     wishes_lost,
 )
-from loopwright.pipeline.config.entries import add_entries
 from loopwright.pipeline.config.exports import ExportParams
 from loopwright.pipeline.config.known import Known
-from loopwright.pipeline.config.params import sections
+from loopwright.pipeline.config.params import add_entries, sections
 from loopwright.pipeline.config.plants import check_name
 from loopwright.pipeline.errors import PipelineError, RecordError
 from loopwright.pipeline.files import draft_folder_of, write_json, write_text

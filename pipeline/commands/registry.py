@@ -11,8 +11,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from loopwright.pipeline.errors import TrackingError
-from loopwright.pipeline.tracking.publish import publish
 from loopwright.pipeline.tracking.registry import CHAMPION, fetch, promote, registered, versions
+from loopwright.pipeline.tracking.runs import publish
 from loopwright.pipeline.tracking.signing import trusted, words
 from loopwright.pipeline.tracking.store import store, store_uri
 from loopwright.serving.words import plain

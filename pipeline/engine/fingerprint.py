@@ -5,10 +5,13 @@ Results of a run must come of one code. A client sends its fingerprint with ever
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import platform
-from collections.abc import Mapping
-from functools import cache
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -64,3 +67,30 @@ def _version(package: str) -> str:
 
 def _short(name: str, value: str) -> str:
     return value[:12] if name == CODE else value
+
+
+_told: ContextVar[str | None] = ContextVar("commit", default=None)
+
+
+def commit() -> str:
+    """Commit of the code, with "-dirty" where it or params.yaml was edited since; "unknown" without a repository."""
+    told = _told.get()
+    if told is not None:
+        return told
+    git = partial(subprocess.run, capture_output=True, text=True, timeout=10)
+    try:
+        head = git(["git", "rev-parse", "HEAD"], check=True).stdout.strip()
+        edited = git(["git", "diff", "--quiet", "HEAD", "--", "pipeline", "serving", "params.yaml"]).returncode
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return head + ("-dirty" if edited else "")
+
+
+@contextlib.contextmanager
+def told(of: str) -> Iterator[None]:
+    """Within, ``of`` is the commit: a worker has no repository, its client has."""
+    token = _told.set(of)
+    try:
+        yield
+    finally:
+        _told.reset(token)

@@ -17,9 +17,9 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from loopwright.pipeline.engine.capture_output import listen
 from loopwright.pipeline.engine.cluster import STAGES, unwatched
 from loopwright.pipeline.engine.fingerprint import fingerprint
+from loopwright.pipeline.engine.output import listen
 
 if TYPE_CHECKING:
     from distributed import Worker

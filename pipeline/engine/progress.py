@@ -20,7 +20,7 @@ from threading import Lock
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from loopwright.pipeline.engine.capture_output import BARS, MARK
+from loopwright.pipeline.engine.output import BARS, MARK
 
 EVERY_S, MARKED_EVERY_S = 10.0, 0.5
 KNOWN = 0.2  # share of a piece after which its speed says how long the rest takes

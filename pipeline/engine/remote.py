@@ -15,12 +15,10 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from loopwright.pipeline.engine.capture_output import BARS
 from loopwright.pipeline.engine.cluster import connected, unwatched
-from loopwright.pipeline.engine.fingerprint import difference, fingerprint
-from loopwright.pipeline.engine.folder import Folder, apply, read_files
-from loopwright.pipeline.engine.git_commit import commit, told
-from loopwright.pipeline.engine.stage_files import StageFiles
+from loopwright.pipeline.engine.fingerprint import commit, difference, fingerprint, told
+from loopwright.pipeline.engine.output import BARS
+from loopwright.pipeline.engine.stage_files import Folder, StageFiles, apply, read_files
 
 FAILED = 2
 
@@ -63,8 +61,8 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     """(exit status, changed files, what was said last), pickled; on a worker."""
     from distributed import get_worker
 
-    from loopwright.pipeline.engine.capture_output import spoken_to
     from loopwright.pipeline.engine.command import run_stage
+    from loopwright.pipeline.engine.output import spoken_to
     from loopwright.pipeline.engine.pieces import Task, doing, mixture, still_wanted
     from loopwright.pipeline.engine.progress import lines_anew
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from loopwright.pipeline.excitation.base import Excitation, OpenLoop
-from loopwright.pipeline.excitation.batches import Batches
 from loopwright.pipeline.excitation.operating_point import OperatingPoint
-from loopwright.pipeline.excitation.sequences import Aprbs, Multisine, Prbs, RandomSteps
+from loopwright.pipeline.excitation.sequences import Aprbs, Batches, Multisine, Prbs, RandomSteps
 
 EXCITATIONS: dict[str, type[Excitation]] = {
     RandomSteps.kind: RandomSteps,

@@ -20,7 +20,7 @@ from loopwright.pipeline.historian.cleaning.tags import GUESSED_PAD, NO_LOOP, Gu
 from loopwright.pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, moves_of
 from loopwright.pipeline.historian.feedback import follows
 from loopwright.pipeline.historian.files.export import Export, Series
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import smallest_difference
 from loopwright.pipeline.metrics import Array
 

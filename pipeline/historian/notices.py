@@ -19,8 +19,7 @@ from loopwright.pipeline.historian.excitation import HELD
 from loopwright.pipeline.historian.files.export import Export, Series
 from loopwright.pipeline.historian.files.signal_statistics import quantum, staircase, straight_share
 from loopwright.pipeline.metrics import Array
-from loopwright.pipeline.records.levels import levels_of, only_between
-from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.records.record import Record, levels_of, only_between
 
 # ------------------------------------------------------------------------------------------ MVs of two or three values
 END = 0.01  # of the range: so near is an end

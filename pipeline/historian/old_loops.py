@@ -13,7 +13,7 @@ from loopwright.pipeline.historian.cleaning.tags import Tag, automatic, by_hand
 from loopwright.pipeline.historian.guessing import loop_in
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.old_loops import OldController, Operated, operation
-from loopwright.pipeline.records.set_points import SetPoints
+from loopwright.pipeline.records.record_file import SetPoints
 
 
 # ------------------------------------------ set point, PV, mode and MV of a loop, and the rows in which it was at work

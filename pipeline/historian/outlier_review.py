@@ -13,7 +13,7 @@ from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.sampling import Sampling
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.files.export import Series
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.metrics import Array
 
 # -------------------------------------------------------------- single readings of an MV that the plant never received

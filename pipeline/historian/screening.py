@@ -36,7 +36,7 @@ from loopwright.pipeline.historian.cleaning.tags import Tag, commanded_range
 from loopwright.pipeline.historian.drift import explained, of_levels, of_quick_models
 from loopwright.pipeline.historian.excitation import SEEN, judged, moves_of, with_rows_out_of_range
 from loopwright.pipeline.historian.files.export import Export, Series
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import quantum
 from loopwright.pipeline.historian.notices import (
     of_files,

@@ -15,7 +15,7 @@ from loopwright.pipeline.historian.cleaning.tag_checks import CODES, apart_zeros
 from loopwright.pipeline.historian.cleaning.tags import KEEP, Tag
 from loopwright.pipeline.historian.drift import explained
 from loopwright.pipeline.historian.files.export import Series
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import runs_of
 from loopwright.pipeline.historian.guessing import seen_range
 from loopwright.pipeline.historian.settling import in_words

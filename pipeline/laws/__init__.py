@@ -7,13 +7,11 @@ from loopwright.pipeline.laws.fuzzy.fuzzy_feedforward import FuzzyFeedforward, F
 from loopwright.pipeline.laws.fuzzy.fuzzy_feedforward_observer import FuzzyFeedforwardObserver
 from loopwright.pipeline.laws.inverse.inverse import INC, INCAD, INCADEC
 from loopwright.pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob
-from loopwright.pipeline.laws.linearized.gauss_newton import GaussNewtonPid, MinimumVariance
-from loopwright.pipeline.laws.linearized.linearized_pid import LinearizedPid
+from loopwright.pipeline.laws.linearized import GaussNewtonPid, LinearizedPid, MinimumVariance
 from loopwright.pipeline.laws.local.pid_networks import AutoPidNetwork, LocalPidNetwork
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.recursive.recursive_pid import RecursivePid
-from loopwright.pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
+from loopwright.pipeline.laws.recursive import RecursivePid, SelfTuningPid
 from loopwright.pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
 from loopwright.pipeline.laws.reference.pi_reference import PiReference
 

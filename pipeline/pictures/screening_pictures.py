@@ -16,7 +16,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.cleaning.findings import TagReport
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import runs_of
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.metrics import Array

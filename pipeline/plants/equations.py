@@ -13,9 +13,8 @@ import casadi as ca
 import numpy as np
 
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.plants.linearization import Linearization
 from loopwright.pipeline.plants.simulator import Advance, AdvanceMany, Array, Simulator
-from loopwright.pipeline.plants.steady import SteadyStates
+from loopwright.pipeline.plants.steady import Linearization, SteadyStates
 from loopwright.serving.manifest import Signal
 
 

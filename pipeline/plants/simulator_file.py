@@ -13,8 +13,8 @@ from typing import Any, final
 import numpy as np
 
 from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.plants.fmu.description import FmuTable, table_path
 from loopwright.pipeline.plants.fmu.program import FmuFile
-from loopwright.pipeline.plants.fmu.table import FmuTable, table_path
 from loopwright.pipeline.plants.program import Interface, Program
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.serving.errors import LoopwrightError

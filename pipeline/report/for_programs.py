@@ -8,7 +8,7 @@ from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import LawEvidence, Row
 from loopwright.pipeline.evaluation.validation import GateRecord, GateResult, LawResult, PaperResult, Titles, Validation
 from loopwright.pipeline.files import digest
-from loopwright.pipeline.pictures.words import law_name
+from loopwright.pipeline.pictures.drawing import law_name
 from loopwright.pipeline.report.verdicts import Judged
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 

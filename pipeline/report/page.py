@@ -14,17 +14,14 @@ from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED, candidates
 from loopwright.pipeline.evaluation.validation import FILE, reference_words
 from loopwright.pipeline.evaluation.verdicts import Claims
 from loopwright.pipeline.optimal.bounds import bounded
-from loopwright.pipeline.pictures.drawing import CasePicture
-from loopwright.pipeline.pictures.numbers import number, ratio
-from loopwright.pipeline.pictures.words import law_name, scenario_name
+from loopwright.pipeline.pictures.drawing import CasePicture, law_name, number, ratio, scenario_name
 from loopwright.pipeline.report.figures import draw_all, main_words
 from loopwright.pipeline.report.for_programs import validation
 from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from loopwright.pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
-from loopwright.pipeline.report.own_acceptance import step_test_to_run
+from loopwright.pipeline.report.own_acceptance import against, beyond_reach, shipped_laws, step_test_to_run
 from loopwright.pipeline.report.templating import REGISTRY_URL, render, write_pages
 from loopwright.pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
-from loopwright.pipeline.report.worse import against, beyond_reach, shipped_laws
 from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span
 from loopwright.pipeline.tuning.rules import PidSettings
 

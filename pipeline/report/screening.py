@@ -12,7 +12,7 @@ from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.files import write_text
 from loopwright.pipeline.historian.cleaning.findings import InputReport, Verdict
 from loopwright.pipeline.historian.excitation import HELD
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.historian.step_test import StepTest
 from loopwright.pipeline.pictures.drawing import axis_label, png, ratio_unit

@@ -8,8 +8,7 @@ from loopwright.pipeline.evaluation.case import Curve, PaperFigure, PaperTable, 
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.validation import Statement
 from loopwright.pipeline.evaluation.verdicts import ABSOLUTE, RELATIVE, Claims, Reason, close, plain_reason
-from loopwright.pipeline.pictures.numbers import number
-from loopwright.pipeline.pictures.words import curve_label
+from loopwright.pipeline.pictures.drawing import curve_label, number
 from loopwright.pipeline.report.own_acceptance import own_acceptance
 
 FINE = 5  # digits shown of a figure that has to be near

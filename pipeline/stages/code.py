@@ -28,7 +28,7 @@ from loopwright.pipeline.engine.stage_files import DATA, EVERY
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.evaluation.evidence_basis import SCREENING
 from loopwright.pipeline.files import digest, sha256, write_json
-from loopwright.pipeline.records.set_points import SET_POINTS
+from loopwright.pipeline.records.record_file import SET_POINTS
 from loopwright.pipeline.stages.paths import WORK
 
 PIPELINE, SERVING = PACKAGES = ("loopwright.pipeline", "loopwright.serving")

@@ -16,15 +16,14 @@ import numpy as np
 from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.config.params import ControllerParams, choose, parse
 from loopwright.pipeline.engine.command import reason, run_stage
-from loopwright.pipeline.engine.git_commit import commit
+from loopwright.pipeline.engine.fingerprint import commit
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import LawError, PipelineError, WithheldError
 from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.evaluation.known import question
 from loopwright.pipeline.evaluation.law_evidence import BASE
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
-from loopwright.pipeline.evaluation.proof import sign_doubts
-from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.evaluation.proof import question, sign_doubts
+from loopwright.pipeline.export.controller_file import export
 from loopwright.pipeline.files import digest, read_json, write_json
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.laws.suitability import require_fit

@@ -158,7 +158,7 @@ def _learn(
     learnt = fits.parts[name].learn(source)
     learnt.model.save(folder / f"seed{seed}" / f"{name}.npz")
     if learnt.sweep is not None:
-        from loopwright.pipeline.pictures.sweep_plot import draw  # here, because matplotlib takes a second to load
+        from loopwright.pipeline.pictures.model_pictures import draw  # here, because matplotlib takes a second to load
 
         learnt.sweep.save(folder / "sweep.json")
         draw(learnt.sweep, folder / "sweep.png")

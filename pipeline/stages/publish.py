@@ -7,7 +7,7 @@ from pathlib import Path
 
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.files import write_json
-from loopwright.pipeline.tracking.publish import publish as write_store
+from loopwright.pipeline.tracking.runs import publish as write_store
 
 RECEIPT = Path("published.json")
 

@@ -17,7 +17,6 @@ from loopwright.pipeline.config.params import CaseParams, ControllerParams, choo
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.evaluation.dead_time import dead_times
 from loopwright.pipeline.evaluation.evidence import WITHHELD, Evidence
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.extrapolation import grounds_of, widest
@@ -31,7 +30,7 @@ from loopwright.pipeline.evaluation.law_evidence import (
     lock_up_text,
 )
 from loopwright.pipeline.evaluation.model_evidence import identified_part
-from loopwright.pipeline.evaluation.open_loop import errors_at_rest, replay
+from loopwright.pipeline.evaluation.open_loop import dead_times, errors_at_rest, replay
 from loopwright.pipeline.evaluation.poor_laws import why_poor
 from loopwright.pipeline.evaluation.trials import Metrics, Trial, step_us, try_files
 from loopwright.pipeline.export.controller_file import with_evidence, withhold

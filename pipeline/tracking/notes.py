@@ -1,11 +1,152 @@
-"""The note at the top of the page of a run or an experiment, in Markdown."""
+"""The figures of a stage that a run shows as metrics: about ten, the ones that decide something.
+
+All other figures stand in the run's artifacts: metrics.json or validation.json as the stage wrote
+it, and ``figures.json``, the same as one table of name and value.
+"""
 
 from __future__ import annotations
 
+import math
+import statistics
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeGuard
+
+from loopwright.pipeline.evaluation.law_evidence import BASE, LawMetrics
 from loopwright.pipeline.evaluation.validation import Validation
+from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 from loopwright.pipeline.tracking.gate import Gate
-from loopwright.pipeline.tracking.headline import ratio_name
-from loopwright.pipeline.tracking.stage_results import StageResult, Times
+from loopwright.pipeline.tracking.stage_results import StageResult, Times, flat
+
+MOST = 12
+OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")
+POINTS = 200
+"""Points of a curve; a training of thousands of iterations is thinned to these."""
+
+Figures = dict[str, float]
+
+
+def headline(kind: str, metrics: Mapping[str, Any], validation: Validation | None) -> Figures:
+    """The metrics of a run of stage ``kind``, from its own metrics.json and its case's validation.json."""
+    figures = {
+        "screen": lambda: _of_record(metrics),
+        "excite": lambda: _of_record(metrics),
+        "fit": lambda: _of_models(metrics),
+        "design": lambda: _of_files(metrics),
+        "validate": lambda: _of_law(metrics, validation),
+        "report": lambda: _of_case(validation),
+    }.get(kind, dict)()
+    finite = {name: float(value) for name, value in figures.items() if _is_figure(value)}
+    return dict(list(finite.items())[:MOST])
+
+
+def ratio_name(validation: Validation | None) -> str:
+    """The name of the gate score among the metrics: ``ratio_to_bound``, or of what else it is a multiple."""
+    other = "nmpc" if validation is None else validation.gate.relative_to
+    return "ratio_to_" + {"nmpc": "bound", "baseline": "baseline", "floor": "noise_floor"}[other]
+
+
+def of_gate(law: str, validation: Validation | None) -> Figures:
+    """The case's score of a law: its error over the bound's or what else is named. A later report may change it."""
+    score = Gate.of(validation, law).score
+    return {ratio_name(validation): float(score)} if _is_figure(score) else {}
+
+
+def _of_record(tree: Mapping[str, Any]) -> dict[str, Any]:
+    seeds = tree.get("per_seed") or {}
+    return {"data_seeds": len(seeds), "rows": sum(row.get("rows", 0) for row in seeds.values())} if seeds else {}
+
+
+def _of_models(tree: Mapping[str, Any]) -> dict[str, Any]:
+    parts = tree.get("parts") or {}
+    rows: dict[str, Any] = {}
+    for part, row in parts.items():
+        before = f"{part}/" if len(parts) > 1 else ""
+        rows |= {f"{before}{name}": row["median"][name] for name in OF_A_MODEL if name in (row.get("median") or {})}
+    seeds = max((len(row.get("per_seed") or {}) for row in parts.values()), default=0)
+    return {"data_seeds": seeds, **rows} if parts else {}
+
+
+def _of_files(tree: Mapping[str, Any]) -> dict[str, Any]:
+    rows = [row for row in tree.get("controllers") or () if row.get("form") == "base"]
+    if not rows:
+        return {}
+    figures = (rows[0].get("analysis") or {}).get("figures") or {}
+    shown = {"data_seeds": len(rows), "bytes": max(r["bytes"] for r in rows), "states": rows[0]["n_state"]}
+    return shown | {f"analysis/{name}": value for name, value in figures.items()}
+
+
+def _of_law(tree: Mapping[str, Any], validation: Validation | None) -> dict[str, Any]:
+    """The case's score on each kind of test, the tests of the gate first: the median over the data seeds."""
+    if not tree:
+        return {}
+    law = LawMetrics.of(tree)
+    tests = law.forms[BASE].tests
+    weights = validation.gate.weights if validation else {}
+    errors = {}
+    plain = (name for name in tests if not name.endswith(NOISE_SUFFIX))
+    for test in sorted(plain, key=lambda name: -max(weights.get(name, 0), weights.get(name + NOISE_SUFFIX, 0))):
+        noisy = test + NOISE_SUFFIX in weights and test not in weights
+        errors[f"{law.metric}/{test}"] = tests[test + NOISE_SUFFIX * noisy].median.get(law.metric)
+    own = validation.laws.get(law.name) if validation else None
+    shown = {
+        **of_gate(law.name, validation),
+        "lock_ups": law.lock_ups,
+        "step_us": own.step_us if own else None,
+        "data_seeds": len(law.seeds),
+    }
+    return shown | _grounds(validation) | errors
+
+
+def _grounds(validation: Validation | None) -> dict[str, Any]:
+    """Free-run fit [%] of the identified models of the tests over rows that they never saw."""
+    grounds = validation.grounds if validation else None
+    return {} if grounds is None else {f"models_free_run_fit/{name}": fit for name, fit in grounds.fit.items()}
+
+
+def _of_case(validation: Validation | None) -> dict[str, Any]:
+    if validation is None:
+        return {}
+    laws = validation.gate.laws
+    scores = [row.score for row in laws.values() if row.score is not None]
+    ratio = ratio_name(validation)
+    shown: dict[str, Any] = {"laws": len(laws), "laws_that_locked_up": sum(bool(r.lock_ups) for r in laws.values())}
+    if scores:
+        shown |= {f"best_{ratio}": min(scores), f"median_{ratio}": statistics.median(scores)}
+    shown |= _grounds(validation)
+    for name, words in (("requirements", "met"), ("claims", "confirmed"), ("paper", "reproduced")):
+        known = [row.holds for row in getattr(validation, name) if row.holds is not None]
+        if known:
+            shown |= {f"{name}/checked": len(known), f"{name}/{words}": sum(known)}
+    return shown
+
+
+def curves(metrics: Mapping[str, Any], sweep: Mapping[str, Any]) -> Iterator[tuple[str, int, float]]:
+    """Name, step and value of the training curves (of the first data seed) and of the sweep over partitions."""
+    for part, row in (metrics.get("parts") or {}).items():
+        seed: Mapping[str, Any] = next(iter((row.get("per_seed") or {}).values()), {})
+        history = seed.get("history") or ()
+        for step in range(0, len(history), max(1, math.ceil(len(history) / POINTS))):
+            if _is_figure(history[step]):
+                yield f"training/{part}", step, float(history[step])
+    for row in sweep.get("rows") or ():
+        for name in ("train", "validation"):
+            value = (row.get(name) or {}).get("rmse")
+            if _is_figure(value):
+                yield f"sweep/{name}_rmse", int(row["partitions"]), float(value)
+
+
+def table(trees: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, float]]:
+    """Every figure of some JSON files as rows of name and value; lists stay in the files alone."""
+    several = len(trees) > 1
+    rows = []
+    for file, tree in trees.items():
+        rows += [(f"{file}: {k}" if several else k, float(v)) for k, v in flat(tree).items() if _is_figure(v)]
+    return rows
+
+
+def _is_figure(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and math.isfinite(value)
+
 
 WHAT = {
     "screen": "Read and screened the export files of the plant *{case}*, and made its record of them."

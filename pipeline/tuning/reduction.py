@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loopwright.pipeline.errors import LawError, PlantError
-from loopwright.pipeline.plants.linearization import Linearization
 from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.steady import Linearization
 
 RANK = 1e-8  # singular values of the Hankel matrix below this share of the largest are rounding
 NOTHING = 1e-14  # a largest one below this share of |C| |B| is nothing at all

@@ -10,8 +10,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loopwright.pipeline.plants.linearization import Linearization
 from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.steady import Linearization
 
 ORDERS = range(1, 7)
 # D. Graham, R. C. Lathrop, The synthesis of "optimum" transient response, AIEE Transactions 72, 1953.

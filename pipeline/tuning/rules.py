@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.plants.linearization import Linearization
 from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning.reduction import LagWithDeadTime, minimal
 
 LONGEST_FILTER = 40.0  # periods; an IMC filter is looked for between half a period and this

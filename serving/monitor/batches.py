@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.monitor.cusum import Chart
-from loopwright.serving.monitor.learning import ANY, COUNT, WEEK_S, Kept, Remembers
-from loopwright.serving.monitor.local_approach import Answers
-from loopwright.serving.monitor.loop_statistics import estimated
-from loopwright.serving.monitor.prediction_error import ranges
+from loopwright.serving.monitor.cusum import ANY, COUNT, WEEK_S, Chart, Kept, Remembers
+from loopwright.serving.monitor.loop_statistics import estimated, ranges
+from loopwright.serving.monitor.plant_drift import Answers
 
 Array: TypeAlias = NDArray[np.float64]
 

@@ -15,12 +15,19 @@ from loopwright.serving.loop import Command, Mode
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.monitor.actuator_checks import AT_END, Following, Plight
 from loopwright.serving.monitor.batches import Batches
-from loopwright.serving.monitor.cusum import Chart
-from loopwright.serving.monitor.learning import DAY_S, TIME_S, WEEK_S, blocks, dead_times, number, pooled, settle_scans
-from loopwright.serving.monitor.local_approach import Answers
-from loopwright.serving.monitor.loop_statistics import Estimates, Share, Swing, harris_index
-from loopwright.serving.monitor.mv_at_rest import RestMap
-from loopwright.serving.monitor.prediction_error import Foresight, log_mean_square
+from loopwright.serving.monitor.cusum import (
+    DAY_S,
+    TIME_S,
+    WEEK_S,
+    Chart,
+    blocks,
+    dead_times,
+    number,
+    pooled,
+    settle_scans,
+)
+from loopwright.serving.monitor.loop_statistics import Estimates, Foresight, Share, Swing, harris_index, log_mean_square
+from loopwright.serving.monitor.plant_drift import Answers, RestMap
 from loopwright.serving.monitor.verdicts import Verdict, failed, verdicts
 
 

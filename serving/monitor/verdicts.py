@@ -30,7 +30,7 @@ import numpy as np
 
 from loopwright.serving.manifest import Signal
 from loopwright.serving.monitor.batches import PARTS
-from loopwright.serving.monitor.prediction_error import Foresight, rms_ratio
+from loopwright.serving.monitor.loop_statistics import Foresight, rms_ratio
 
 if TYPE_CHECKING:
     from loopwright.serving.monitor.monitor import Monitor

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from loopwright.serving.errors import EndpointError, LoopError
 from loopwright.serving.guard import Sample
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.opcua.answers import LateError
 from loopwright.serving.opcua.heartbeat import Heartbeat
 from loopwright.serving.opcua.lease import LeaseRefusedError, NodeLease
 from loopwright.serving.opcua.link import Link
@@ -25,7 +24,7 @@ from loopwright.serving.opcua.nameplates import Identity, Nameplates, identity, 
 from loopwright.serving.opcua.plan import Plan
 from loopwright.serving.opcua.sampling import Ages, Sampling, Values
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import GOOD, Reading, words
+from loopwright.serving.opcua.values import GOOD, LateError, Reading, words
 from loopwright.serving.words import first_line, named
 
 __all__ = ["OpcUaEndpoint", "Values"]

@@ -12,9 +12,8 @@ from contextlib import suppress
 from asyncua import ua
 
 from loopwright.serving.errors import EndpointError, LoopError
-from loopwright.serving.opcua.answers import unanswered
 from loopwright.serving.opcua.link import Link
-from loopwright.serving.opcua.values import GOOD, words
+from loopwright.serving.opcua.values import GOOD, unanswered, words
 
 NAME = "LoopwrightLease"  # of a node beside those of the MVs: it is the lease of every loop that is told of none
 WRITABLE = 2  # the second bit of an access level

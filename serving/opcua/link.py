@@ -14,11 +14,21 @@ from asyncua import Client, ua
 from asyncua.crypto import security_policies
 
 from loopwright.serving.errors import EndpointError, LoopError
-from loopwright.serving.opcua.answers import BUSY, GONE, TOO_MANY, BusyError, LateError, in_time, reason
 from loopwright.serving.opcua.certificates import APPLICATION, identity, require_valid
 from loopwright.serving.opcua.limits import LIMITS, OperationLimits, TooManyError, in_pieces
 from loopwright.serving.opcua.settings import Server
-from loopwright.serving.opcua.values import EPOCH, Reading, reading
+from loopwright.serving.opcua.values import (
+    BUSY,
+    EPOCH,
+    GONE,
+    TOO_MANY,
+    BusyError,
+    LateError,
+    Reading,
+    in_time,
+    reading,
+    reason,
+)
 
 # How long a server is asked to keep a session of which it hears nothing: some periods, within these bounds.
 SESSION, LEAST_SESSION_S, MOST_SESSION_S = 3, 60.0, 3600.0

@@ -17,11 +17,10 @@ from asyncua import ua
 from loopwright.serving.errors import EndpointError
 from loopwright.serving.guard import Fault
 from loopwright.serving.manifest import Manifest, Signal
-from loopwright.serving.opcua.answers import unanswered
 from loopwright.serving.opcua.link import Link, node_id
 from loopwright.serving.opcua.plan import Plan, Role, Row
 from loopwright.serving.opcua.settings import Nodes, Point
-from loopwright.serving.opcua.values import FLOATS, INTEGERS
+from loopwright.serving.opcua.values import FLOATS, INTEGERS, unanswered
 
 LOOK_S, WRONG_S = 60.0, 2.0  # between two looks at what may change without a new connection; while something is wrong
 UNKNOWN = "-"

@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 
 from loopwright.serving.errors import LoopwrightError
 from loopwright.serving.journal import JournalReader
-from loopwright.serving.journal.reader import Entry
+from loopwright.serving.journal.entries import Entry
 from loopwright.serving.page.trend import plain
 from loopwright.serving.words import named
 

@@ -24,12 +24,11 @@ from loopwright.serving.guard import Sample
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command, Mode
 from loopwright.serving.manifest import Manifest, Signal
-from loopwright.serving.proof import judged
 from loopwright.serving.station.control import ask
 from loopwright.serving.station.journal_export import export, happened, journal_of, lines, tag_table, write_csv
 from loopwright.serving.station.requests import TRIAL
 from loopwright.serving.station.settings import Settings, template
-from loopwright.serving.trust import Controller, ending
+from loopwright.serving.trust import Controller, ending, judged
 from loopwright.serving.words import plain
 
 SETTINGS = Path("loop.toml")
@@ -181,8 +180,7 @@ def _check(options: argparse.Namespace) -> int:
     manifest = controller.manifest
     from loopwright.serving.opcua.inspection import Found, inspected
     from loopwright.serving.opcua.nameplates import Seen, others_since
-    from loopwright.serving.station.build_loop import rehearsed, require_free
-    from loopwright.serving.station.startup import namespaces_before, nodes_before
+    from loopwright.serving.station.build_loop import namespaces_before, nodes_before, rehearsed, require_free
 
     here = rehearsed(settings, controller)
     for line in here.wrong:
@@ -266,8 +264,7 @@ def _run(options: argparse.Namespace) -> int:
 def _misfits(settings: Settings, manifest: Manifest) -> list[str]:
     """Faults of ``loop check`` that are for good: another unit, a node that is not there. None while nobody answers."""
     from loopwright.serving.opcua.inspection import inspected
-    from loopwright.serving.station.build_loop import require_free
-    from loopwright.serving.station.startup import namespaces_before
+    from loopwright.serving.station.build_loop import namespaces_before, require_free
 
     before = namespaces_before(settings.journal.file, settings.server.endpoint)
     with suppress(EndpointError):

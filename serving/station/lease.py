@@ -15,7 +15,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from loopwright.serving.errors import LoopError
-from loopwright.serving.journal.file_lock import LockTakenError, locked
+from loopwright.serving.journal.file import LockTakenError, locked
 from loopwright.serving.loop import ControlLoop, Mode
 from loopwright.serving.opcua.nameplates import Identity
 from loopwright.serving.station.recorder import Recorder

@@ -15,9 +15,8 @@ from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import ControlLoop, Mode, within
 from loopwright.serving.manifest import Signal
 from loopwright.serving.opcua.sampling import Values
-from loopwright.serving.proof import require_accepted
 from loopwright.serving.station.recorder import named
-from loopwright.serving.trust import signer
+from loopwright.serving.trust import require_accepted, signer
 
 MODE = "mode"
 

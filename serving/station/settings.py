@@ -121,7 +121,7 @@ class Settings:
 
     ``trusted`` names public keys: only a controller that one of them signed is loaded, at the start and by a swap
     (None: any is). ``accept_unproven`` lets a controller into AUTO whose file does not prove it in closed loop, see
-    ``loopwright.serving.proof``. ``page`` is HOST:PORT or a table (see ``loopwright.serving.page.settings``); empty:
+    ``loopwright.serving.trust``. ``page`` is HOST:PORT or a table (see ``loopwright.serving.page.settings``); empty:
     none.
     """
 

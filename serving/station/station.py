@@ -27,18 +27,10 @@ from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.nameplates import Identity, others_since
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.page.process import PageProcess
-from loopwright.serving.proof import judged
-from loopwright.serving.station.build_loop import control_loop
-from loopwright.serving.station.control import Answer, Control
-from loopwright.serving.station.housekeeping import Said, Tending
-from loopwright.serving.station.lease import Lease, Locks
-from loopwright.serving.station.monitor_runner import Watching
-from loopwright.serving.station.recorder import Recorder
-from loopwright.serving.station.requests import Change, Request, Wishes, change, require_proven
-from loopwright.serving.station.settings import Settings
-from loopwright.serving.station.startup import (
+from loopwright.serving.station.build_loop import (
     another_before,
     begun_at,
+    control_loop,
     keep_namespaces,
     keep_nodes,
     namespaces_before,
@@ -46,9 +38,15 @@ from loopwright.serving.station.startup import (
     nodes_before,
     usable,
 )
+from loopwright.serving.station.control import Answer, Control
+from loopwright.serving.station.housekeeping import Said, Tending
+from loopwright.serving.station.lease import Lease, Locks
+from loopwright.serving.station.recorder import Recorder, Watching
+from loopwright.serving.station.requests import Change, Request, Wishes, change, require_proven
+from loopwright.serving.station.settings import Settings
 from loopwright.serving.station.views import Snapshot, about, picture, state
 from loopwright.serving.trust import Controller as TrustedController
-from loopwright.serving.trust import ending, signer
+from loopwright.serving.trust import ending, judged, signer
 from loopwright.serving.words import first_line
 
 if TYPE_CHECKING:

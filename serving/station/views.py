@@ -15,8 +15,7 @@ from loopwright.serving.journal import columns
 from loopwright.serving.loop import Command, ControlLoop
 from loopwright.serving.monitor import Monitor, Verdict
 from loopwright.serving.opcua.values import words
-from loopwright.serving.proof import judged
-from loopwright.serving.trust import signer
+from loopwright.serving.trust import judged, signer
 from loopwright.serving.words import plain_tree
 
 if TYPE_CHECKING:

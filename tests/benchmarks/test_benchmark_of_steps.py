@@ -26,7 +26,7 @@ def step(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 class Bench:
-    """Stands for ``loopwright.serving.bench.bench``: each round takes 3 s of its clock, with equal figures."""
+    """Stands for ``loopwright.serving.card.bench``: each round takes 3 s of its clock, with equal figures."""
 
     def __init__(self, hot_us: float, capsys: Any) -> None:
         self.now, self.hot_us, self.capsys, self.calls, self.shown = 0.0, hot_us, capsys, 0, ""

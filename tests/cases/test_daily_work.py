@@ -16,7 +16,7 @@ from loopwright.pipeline.cases.own_tests import LEAST, MOST, day, spread, window
 from loopwright.pipeline.evaluation.trials import Trials
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.metrics import mae
-from loopwright.pipeline.records.set_points import SetPoints, stretches
+from loopwright.pipeline.records.record_file import SetPoints, stretches
 from loopwright.pipeline.simulation.simulate import simulate_closed
 from loopwright.pipeline.tuning.rules import PidSettings
 

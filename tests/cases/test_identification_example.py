@@ -12,7 +12,7 @@ from loopwright.pipeline.cases.ph_neutralization.models import MODELS
 from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.models import Learnt
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.part import Source
 
 N = 100

@@ -14,9 +14,15 @@ from fmu_parts import EXAMPLE, FMI_2, fmu
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.cases.own_simulator import SimulatedCase
-from loopwright.pipeline.commands.own_plant.fmu_variables import MISSING, proposals, table_from
-from loopwright.pipeline.commands.own_plant.from_simulator import SLOW, WANTED, simulated
-from loopwright.pipeline.excitation.first_test import first_test
+from loopwright.pipeline.commands.own_plant.from_simulator import (
+    MISSING,
+    SLOW,
+    WANTED,
+    proposals,
+    simulated,
+    table_from,
+)
+from loopwright.pipeline.excitation.planned import first_test
 from loopwright.pipeline.files import sha256
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.plants.fmu.description import described
@@ -105,7 +111,7 @@ def test_nothing_is_asked_where_the_fmu_says_all(here: Path) -> None:
 def test_a_short_step_for_a_fast_solver_becomes_a_period_that_suits_the_plant(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("loopwright.pipeline.excitation.first_test.LONGEST", 640)
+    monkeypatch.setattr("loopwright.pipeline.excitation.planned.LONGEST", 640)
     path = fmu(here, CLEAR.replace('stepSize="30"', 'stepSize="1.5"'))  # it settles in 1060 of them
     table = table_from(path, (), "", None)
     assert table is not None

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from loopwright.pipeline.config.entries import add_entries
+from loopwright.pipeline.config.params import add_entries
 from loopwright.pipeline.errors import ParamsError
 
 TEXT = """# Settings.

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from loopwright.pipeline.config.entries import add_entries
+from loopwright.pipeline.config.params import add_entries
 from loopwright.pipeline.config.plants import PlantParams, check_name
 from loopwright.pipeline.errors import ParamsError
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from pages import DOCS, PAGES, ROOT
 
-from loopwright.serving.monitor.learning import blocks, pooled
+from loopwright.serving.monitor.cusum import blocks, pooled
 from loopwright.serving.monitor.monitor import BLOCK, LEARN_BLOCKS, LEARN_MODEL, LEARN_RESTS
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from loopwright.pipeline.engine.capture_output import BARS, MARK
+from loopwright.pipeline.engine.output import BARS, MARK
 from loopwright.pipeline.engine.parallel_dvc import Bars
 from loopwright.pipeline.engine.progress import Lines, Piece
 

@@ -9,7 +9,7 @@ from select import select
 
 PROGRAM = """
 import subprocess, sys, threading
-from loopwright.pipeline.engine.stderr_filter import outlet
+from loopwright.pipeline.engine.output import outlet
 stopped = threading.Event()
 with outlet(stopped):
     subprocess.run([sys.executable, "-c", "import sys; print('from a worker', file=sys.stderr)"])
@@ -39,7 +39,7 @@ def test_nothing_comes_of_a_stopped_run() -> None:
 
 MANY = """
 import subprocess, sys, threading
-from loopwright.pipeline.engine.stderr_filter import outlet
+from loopwright.pipeline.engine.output import outlet
 with outlet(threading.Event()):
     subprocess.run([sys.executable, "-c", "import os; [os.write(2, b'0123456789' * 1000) for _ in range(50)]"])
 print("done", flush=True)
@@ -63,7 +63,7 @@ def test_a_byte_of_zero_ends_nothing() -> None:
 
 TORN = """
 import os, threading
-from loopwright.pipeline.engine.stderr_filter import outlet
+from loopwright.pipeline.engine.output import outlet
 os.urandom = lambda n: b"\\n" * n
 with outlet(stopped := threading.Event()):
     os.write(2, {text!r})

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.cases import CASES
-from loopwright.pipeline.evaluation.dead_time import LONGEST, dead_times
+from loopwright.pipeline.evaluation.open_loop import LONGEST, dead_times
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.serving.manifest import Signal
 
@@ -49,7 +49,7 @@ def test_the_quickest_mv_counts_for_each_controlled_variable(
 
 
 def test_a_variable_that_never_answers_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("loopwright.pipeline.evaluation.dead_time.LONGEST", 5)
+    monkeypatch.setattr("loopwright.pipeline.evaluation.open_loop.LONGEST", 5)
     assert dead_times(Delayed(3, 9, 9)) == [3, None]
 
 

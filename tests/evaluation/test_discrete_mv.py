@@ -12,7 +12,7 @@ from shipped import required
 
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import PLANTS
-from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.export.controller_file import export
 from loopwright.pipeline.laws import LAWS
 from loopwright.serving import (
     Controller,
@@ -24,8 +24,7 @@ from loopwright.serving import (
     VirtualClock,
     default_guards,
 )
-from loopwright.serving.bench import bench
-from loopwright.serving.card import card
+from loopwright.serving.card import bench, card
 
 CASE = "jacketed_batch_reactor"
 PV = np.array([30.0, 35.0])

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from own_cases import controllers_of_a_lag
 
-from loopwright.pipeline.evaluation.known import known_rows, question
-from loopwright.pipeline.evaluation.proof import sign_doubts, statements
+from loopwright.pipeline.evaluation.proof import known_rows, question, sign_doubts, statements
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.stages.design import design
 from loopwright.pipeline.stages.report import report

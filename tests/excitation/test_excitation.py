@@ -16,9 +16,8 @@ from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.excitation import EXCITATIONS as GENERAL
 from loopwright.pipeline.excitation import Excitation, OpenLoop
-from loopwright.pipeline.excitation.batches import Batches
 from loopwright.pipeline.excitation.operating_point import OperatingPoint
-from loopwright.pipeline.excitation.sequences import TAPS, Aprbs, Multisine, Prbs, RandomSteps, maximal_length
+from loopwright.pipeline.excitation.sequences import TAPS, Aprbs, Batches, Multisine, Prbs, RandomSteps, maximal_length
 from loopwright.pipeline.models.training.regressors import forward_pairs, inverse_pairs
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.simulate import simulate_open

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.excitation.first_test import first_test
+from loopwright.pipeline.excitation.planned import first_test
 from loopwright.pipeline.plants.simulator_file import FileSimulator
 
 FILE = """

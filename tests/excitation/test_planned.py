@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.excitation.first_test import first_test
-from loopwright.pipeline.excitation.planned import excited, planned
+from loopwright.pipeline.excitation.planned import excited, first_test, planned
 from loopwright.pipeline.plants.simulator_file import FileSimulator
 
 LAG = """

@@ -16,10 +16,8 @@ from quick_laws import STEPS_OF_GATE
 from torch import Tensor
 
 from loopwright.pipeline.errors import ExportError
-from loopwright.pipeline.export import gate
-from loopwright.pipeline.export.controller_file import with_evidence
-from loopwright.pipeline.export.gate import GATE_TOLERANCE, export, parity_gate
-from loopwright.pipeline.export.graph import law_graph
+from loopwright.pipeline.export import controller_file
+from loopwright.pipeline.export.controller_file import GATE_TOLERANCE, export, parity_gate, with_evidence
 from loopwright.pipeline.laws import ControlLaw
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving import Controller, Signal
@@ -33,7 +31,7 @@ ONE = Signal("x", "-", -1e6, 1e6)
 
 @pytest.fixture(autouse=True)
 def whole_gate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gate, "GATE_STEPS", STEPS_OF_GATE)
+    monkeypatch.setattr(controller_file, "GATE_STEPS", STEPS_OF_GATE)
 
 
 def loop_signals(**changed: Any) -> Signals:

@@ -12,7 +12,7 @@ from dirty_plant import PERIOD_S, TAGS, Clean, cells, clean, screen, screen_of, 
 
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.cleaning.tags import Tag
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.screening import Screened
 
 SEED = np.random.default_rng(5)

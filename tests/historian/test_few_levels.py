@@ -12,7 +12,7 @@ from dirty_plant import TAGS, clean, screen_of, spoilt
 from loopwright.pipeline.historian.cleaning.tags import Tag, named
 from loopwright.pipeline.historian.notices import on_off
 from loopwright.pipeline.historian.screening import Screened, refusal
-from loopwright.pipeline.records.levels import levels_of, only_between
+from loopwright.pipeline.records.record import levels_of, only_between
 
 PV, MV, DV = TAGS
 PERCENT = (PV, replace(MV, low=0.0, high=100.0), DV)

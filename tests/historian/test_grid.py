@@ -12,7 +12,7 @@ from loopwright.pipeline.historian.cleaning import grid as grid_module
 from loopwright.pipeline.historian.cleaning.grid import resampled
 from loopwright.pipeline.historian.cleaning.sampling import proposed_period, sampling
 from loopwright.pipeline.historian.files.export import Series
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 
 
 def series(tag: str, t: np.ndarray, v: np.ndarray) -> Series:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, cells, clean, screen, screen_of, steps, write
 
-from loopwright.pipeline.config.exports import ExportParams
-from loopwright.pipeline.config.intervals import Interval
+from loopwright.pipeline.config.exports import ExportParams, Interval
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.screening import Screened
 
 DATES = "2024-03-04T06:10:00..2024-03-04T06:20:00"  # minutes 10 to 20 of the record

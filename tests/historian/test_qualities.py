@@ -11,8 +11,7 @@ import pytest
 from dirty_plant import TAGS, cells, clean, write
 
 from loopwright.pipeline.historian.files.file_reader import read_export
-from loopwright.pipeline.historian.files.quality import meaning_of
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason, meaning_of
 
 N = 60
 NAMES = [t.tag for t in TAGS]

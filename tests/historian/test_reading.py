@@ -19,7 +19,7 @@ from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.files.dialect import sniff
 from loopwright.pipeline.historian.files.file_reader import read_export, units_of
 from loopwright.pipeline.historian.files.numbers import numbers
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 
 N = 60
 DATA = clean(N)

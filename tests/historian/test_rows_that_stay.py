@@ -15,7 +15,7 @@ from loopwright.pipeline.historian.cleaning.sampling import sampling
 from loopwright.pipeline.historian.cleaning.tags import Tag, named, read_tags
 from loopwright.pipeline.historian.export_params import exported, signal_tags
 from loopwright.pipeline.historian.files.export import Export, Series
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.screening import Screened, screened
 
 PV, MV, DV = TAGS

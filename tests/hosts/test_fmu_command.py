@@ -16,7 +16,7 @@ from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.commands import Parser
 from loopwright.pipeline.commands.fmu import options
 from loopwright.pipeline.hosts.fmu.compiling import HEADER, HOSTS, SHIPPED, SHIPPED_SHA256, SOURCES
-from loopwright.pipeline.hosts.fmu.variables import variables_of
+from loopwright.pipeline.hosts.fmu.folder import variables_of
 from loopwright.serving import Controller
 
 if MISSING:

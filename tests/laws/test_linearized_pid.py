@@ -16,10 +16,10 @@ from loopwright.pipeline.excitation import EXCITATIONS
 from loopwright.pipeline.export.graph import law_graph
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.laws.gain_update import gain_update
-from loopwright.pipeline.laws.linearized.linearized_pid import LinearizedPid
+from loopwright.pipeline.laws.linearized import LinearizedPid
 from loopwright.pipeline.laws.scaled_defaults import in_units
 from loopwright.pipeline.models.lagged.instantaneous import linearize
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 
 PH = PhNeutralizationCase()
 UNIT = 100.0  # [ml/min] half the range of the base flow

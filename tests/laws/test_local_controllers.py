@@ -17,7 +17,7 @@ from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.laws.local.local_controllers import LocalControllers, StabilityTest
 from loopwright.pipeline.laws.local.pid_networks import one_knob
-from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning.rules import PidSettings, sampled_loop
 from loopwright.pipeline.tuning.stability import FrozenLoops, spectral_radius
 

@@ -13,14 +13,12 @@ from shipped import required
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.excitation.batches import Batches
-from loopwright.pipeline.excitation.sequences import RandomSteps
+from loopwright.pipeline.excitation.sequences import Batches, RandomSteps
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.laws.gain_update import gain_update
-from loopwright.pipeline.laws.recursive.recursive_pid import RecursivePid
-from loopwright.pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
+from loopwright.pipeline.laws.recursive import RecursivePid, SelfTuningPid
 from loopwright.pipeline.models import Model
-from loopwright.pipeline.models.lagged.arx import ARX, ArxPart
+from loopwright.pipeline.models.lagged.lagged import ARX, ArxPart
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario

@@ -25,7 +25,7 @@ from loopwright.pipeline.laws.reference.reference_networks import (
     TwoErrorNetwork,
 )
 from loopwright.pipeline.laws.reference.reference_training import follow, train
-from loopwright.pipeline.models.state_space.state_space import StateSpace
+from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed

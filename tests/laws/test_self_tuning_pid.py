@@ -11,9 +11,9 @@ from shipped import required
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.excitation.sequences import RandomSteps
 from loopwright.pipeline.laws.base import ControlLaw
-from loopwright.pipeline.laws.recursive.self_tuning_pid import SelfTuningPid
+from loopwright.pipeline.laws.recursive import SelfTuningPid
 from loopwright.pipeline.models import Model
-from loopwright.pipeline.models.lagged.arx import ARX, ArxPart
+from loopwright.pipeline.models.lagged.lagged import ARX, ArxPart
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import simulate_closed

@@ -11,7 +11,7 @@ import torch
 from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from loopwright.pipeline.errors import ModelError, ParamsError
 from loopwright.pipeline.models import MODELS, load_model
-from loopwright.pipeline.models.lagged.arx import ARX, ArxPart
+from loopwright.pipeline.models.lagged.lagged import ARX, ArxPart
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.models.training.regressors import nnarx_pairs
 from loopwright.pipeline.records.record import Record

@@ -11,11 +11,17 @@ import torch
 from torch.func import functional_call, jacrev, vmap
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.models.training.fit import LBFGS, TRAINERS, Adam, LevenbergMarquardt
-from loopwright.pipeline.models.training.jacobian import input_jacobian, parameter_jacobian, scaled_output
-from loopwright.pipeline.models.training.objectives import Objective, Samples, Windows
+from loopwright.pipeline.models.training.objectives import (
+    Objective,
+    Samples,
+    Windows,
+    input_jacobian,
+    parameter_jacobian,
+    scaled_output,
+)
 
 
 def network(hidden: tuple[int, ...], n_out: int = 1, residual: bool = True, seed: int = 0) -> tuple[MLP, np.ndarray]:

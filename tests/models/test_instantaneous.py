@@ -9,7 +9,7 @@ from torch.func import jacrev, vmap
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.lagged.instantaneous import AlongMv, arx, linearize
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 
 SHAPES = [
     (n_y, n_u, hidden, residual)

@@ -15,7 +15,7 @@ from loopwright.pipeline.cases.thiosulfate_cstr.plant import ThiosulfateCstr
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import ModelError, ParamsError, RecordError
 from loopwright.pipeline.models import load_model
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.lagged.nnarx_part import Candidate, NnarxPart, parsimonious
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.models.training.objectives import Windows, regressor

@@ -10,7 +10,7 @@ from loopwright.pipeline.cases import PLANTS
 from loopwright.pipeline.excitation import EXCITATIONS
 from loopwright.pipeline.metrics import rmse
 from loopwright.pipeline.models import Learnt
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.lagged.nnarx_part import NnarxPart
 from loopwright.pipeline.models.part import Source, predict
 from loopwright.pipeline.models.training.objectives import Windows

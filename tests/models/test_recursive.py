@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.models.lagged.recursive import RecursiveLeastSquares
+from loopwright.pipeline.models.lagged.recursive_arx import RecursiveLeastSquares
 
 
 def drawn(seed: int, rows: int, n: int) -> tuple[torch.Tensor, torch.Tensor]:

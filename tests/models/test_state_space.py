@@ -18,7 +18,7 @@ from loopwright.pipeline.models import load_model
 from loopwright.pipeline.models.base import simulate
 from loopwright.pipeline.models.lagged.nnarx_part import NnarxPart
 from loopwright.pipeline.models.part import Source
-from loopwright.pipeline.models.state_space.state_space import StateSpace, StateSpacePart, StateWindows, one_step_pairs
+from loopwright.pipeline.models.state_space import StateSpace, StateSpacePart, StateWindows, one_step_pairs
 from loopwright.pipeline.models.training.objectives import Samples
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.manifest import Signal

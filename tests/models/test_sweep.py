@@ -15,7 +15,7 @@ from loopwright.pipeline.models.static.fuzzy_means import FuzzyMeansRBF, grid_po
 from loopwright.pipeline.models.static.least_squares import solve_iterative, solve_qr
 from loopwright.pipeline.models.static.rbf import design_matrix
 from loopwright.pipeline.models.static.sweep import SweepResult, _cells, sweep
-from loopwright.pipeline.pictures.sweep_plot import draw
+from loopwright.pipeline.pictures.model_pictures import draw
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,9 @@ import pytest
 from fmu_parts import EXAMPLE, FMI_2, FMI_3, KEEPS_2, KEEPS_3, TABLE, WRITES_2, WRITES_3, fmu, plant
 
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.plants.fmu.instance import Instance
-from loopwright.pipeline.plants.fmu.memory import INSTANCES, KEPT
+from loopwright.pipeline.plants.fmu.description import FmuRow, FmuTable
+from loopwright.pipeline.plants.fmu.instance import INSTANCES, KEPT, Instance
 from loopwright.pipeline.plants.fmu.program import PREFIX
-from loopwright.pipeline.plants.fmu.table import FmuRow, FmuTable
 from loopwright.pipeline.plants.simulator_file import FileSimulator
 from loopwright.pipeline.simulation.simulate import simulate_open
 from loopwright.serving.manifest import Signal

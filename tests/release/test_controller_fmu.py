@@ -22,10 +22,10 @@ from loopwright.pipeline.hosts.fmu.folder import (
     identifier_of,
     pack,
     token_of,
+    variables_of,
     write_folder,
 )
 from loopwright.pipeline.hosts.fmu.gate import check, problems
-from loopwright.pipeline.hosts.fmu.variables import variables_of
 from loopwright.serving import Controller
 from loopwright.serving.conformance.steps import Answer, answered
 

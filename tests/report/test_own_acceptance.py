@@ -14,10 +14,16 @@ from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
 from loopwright.pipeline.evaluation.validation import Statement
 from loopwright.pipeline.evaluation.verdicts import PLAIN
-from loopwright.pipeline.report.own_acceptance import own_acceptance
+from loopwright.pipeline.report.own_acceptance import (
+    against,
+    beyond_reach,
+    own_acceptance,
+    shipped_laws,
+    worse_tests,
+    worst_test,
+)
 from loopwright.pipeline.report.page import headline, over_old_loop
 from loopwright.pipeline.report.verdicts import acceptance
-from loopwright.pipeline.report.worse import against, beyond_reach, shipped_laws, worse_tests, worst_test
 
 NOISE = 0.01
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")

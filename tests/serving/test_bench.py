@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from loopwright.serving import Controller
-from loopwright.serving import bench as module
-from loopwright.serving.bench import Timing, bench, table
+from loopwright.serving import card as module
+from loopwright.serving.card import Timing, bench, table
 
 pytest_plugins = ["small_laws"]
 

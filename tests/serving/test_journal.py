@@ -23,9 +23,8 @@ from processes import within
 
 from loopwright.serving import Controller, LoopError
 from loopwright.serving.journal import Event, Journal, JournalReader, Scan, columns, writer
-from loopwright.serving.journal.entries import Kind, packed, unpacked
+from loopwright.serving.journal.entries import EVENT, Kind, packed, unpacked
 from loopwright.serving.journal.file import TABLES
-from loopwright.serving.journal.reader import EVENT
 from loopwright.serving.journal.writer import BLOCK, FRESH, LEAST_EVENTS, SLACK, shorten_events
 from loopwright.serving.page import app
 from loopwright.serving.station.recorder import Recorder

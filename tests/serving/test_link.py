@@ -15,14 +15,13 @@ from processes import within
 
 from loopwright.serving import Controller
 from loopwright.serving.errors import EndpointError, LoopError
-from loopwright.serving.opcua.answers import LateError, in_time
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.lease import SeveralLeasesError, beside
 from loopwright.serving.opcua.limits import OperationLimits, Pieces, TooManyError, in_pieces
 from loopwright.serving.opcua.link import Link, node_id
 from loopwright.serving.opcua.plan import Plan
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import Reading
+from loopwright.serving.opcua.values import LateError, Reading, in_time
 
 pytest_plugins = ["small_laws"]
 

@@ -18,12 +18,9 @@ from hypothesis import strategies as st
 from loopwright.serving import Command, Controller, Manifest, Mode, Sample, Signal
 from loopwright.serving.monitor import Monitor
 from loopwright.serving.monitor.actuator_checks import Plight
-from loopwright.serving.monitor.cusum import Chart, correlation, run_limit, upper_scatter
-from loopwright.serving.monitor.learning import dead_times, settle_scans
-from loopwright.serving.monitor.local_approach import Answers
-from loopwright.serving.monitor.loop_statistics import Swing, harris_index
-from loopwright.serving.monitor.mv_at_rest import RestMap
-from loopwright.serving.monitor.prediction_error import Foresight
+from loopwright.serving.monitor.cusum import Chart, correlation, dead_times, run_limit, settle_scans, upper_scatter
+from loopwright.serving.monitor.loop_statistics import Foresight, Swing, harris_index
+from loopwright.serving.monitor.plant_drift import Answers, RestMap
 
 pytest_plugins = ["small_laws"]
 

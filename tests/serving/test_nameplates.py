@@ -16,16 +16,15 @@ from loopwright.serving import Controller
 from loopwright.serving.errors import EndpointError
 from loopwright.serving.journal import Journal
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.opcua.answers import BusyError, LateError
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.link import node_id
 from loopwright.serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity, others_since
 from loopwright.serving.opcua.plan import Plan
 from loopwright.serving.opcua.sampling import Ages, Sampling, Values
 from loopwright.serving.opcua.settings import ModeNode, Nodes, Point, Server
-from loopwright.serving.opcua.values import Reading
+from loopwright.serving.opcua.values import BusyError, LateError, Reading
+from loopwright.serving.station.build_loop import keep_namespaces, keep_nodes, namespaces_before, nodes_before
 from loopwright.serving.station.requests import Wishes
-from loopwright.serving.station.startup import keep_namespaces, keep_nodes, namespaces_before, nodes_before
 
 pytest_plugins = ["small_laws"]
 UA_SPACE = "http://opcfoundation.org/UA/"

@@ -12,11 +12,10 @@ from asyncua import ua
 from processes import within
 
 from loopwright.serving import Controller, EndpointError
-from loopwright.serving.opcua.answers import LateError
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.link import Link, node_id
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import Reading
+from loopwright.serving.opcua.values import LateError, Reading
 
 pytest_plugins = ["small_laws"]
 GOOD, REFUSED, MISMATCH = 0, ua.StatusCodes.BadNotWritable, ua.StatusCodes.BadTypeMismatch

@@ -11,8 +11,8 @@ import pytest
 
 from loopwright.serving import Controller, ControlLoop, LoopError, Mode
 from loopwright.serving.controller_file import manifest_in
-from loopwright.serving.proof import Proof, judged
 from loopwright.serving.station.requests import Change, Request, change
+from loopwright.serving.trust import Proof, judged
 
 FILE = Path(__file__).parents[2] / "artifacts" / "jacketed_batch_reactor" / "fuzzy_feedforward_observer.onnx"
 

@@ -24,11 +24,11 @@ from plant_servers import UNKNOWN, Plant, RunningLoop, spoil
 from processes import within
 
 from loopwright.pipeline.__main__ import main
-from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.export.controller_file import export
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving import Controller, LoopError, Mode
 from loopwright.serving.journal import JournalReader
-from loopwright.serving.journal.reader import Entry
+from loopwright.serving.journal.entries import Entry
 from loopwright.serving.monitor import Monitor, Verdict
 from loopwright.serving.page.app import candidates
 from loopwright.serving.station.control import ask

@@ -16,8 +16,7 @@ from processes import within
 from loopwright.serving import Command, Controller, Mode
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.monitor import Monitor, Verdict
-from loopwright.serving.station.monitor_runner import Watching
-from loopwright.serving.station.recorder import Recorder
+from loopwright.serving.station.recorder import Recorder, Watching
 from loopwright.serving.station.station import Station
 
 FILE = Path(__file__).parents[2] / "artifacts" / "ph_neutralization" / "pid.onnx"

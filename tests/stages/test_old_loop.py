@@ -13,7 +13,7 @@ from rich.console import Console
 from undrawn import draw_nothing
 
 from loopwright.pipeline.evaluation.validation import Validation
-from loopwright.pipeline.records.set_points import SetPoints
+from loopwright.pipeline.records.record_file import SetPoints
 from loopwright.pipeline.report.results import show_results
 from loopwright.pipeline.stages.design import design
 from loopwright.pipeline.stages.report import report

@@ -16,8 +16,8 @@ from mlflow.entities.model_registry import ModelVersion
 from loopwright.pipeline.__main__ import main as loopwright
 from loopwright.pipeline.errors import TrackingError
 from loopwright.pipeline.tracking import signing
-from loopwright.pipeline.tracking.publish import publish
 from loopwright.pipeline.tracking.registry import versions
+from loopwright.pipeline.tracking.runs import publish
 from loopwright.pipeline.tracking.store import store
 from loopwright.serving import Controller, SignatureError
 from loopwright.serving.signing.keys import PublicKey, make_pair

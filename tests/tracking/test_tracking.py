@@ -27,8 +27,8 @@ from loopwright.pipeline.errors import TrackingError
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.files import sha256
 from loopwright.pipeline.tracking.gate import Gate
-from loopwright.pipeline.tracking.publish import publish
 from loopwright.pipeline.tracking.registry import REQUIREMENTS, versions
+from loopwright.pipeline.tracking.runs import publish
 from loopwright.pipeline.tracking.stage_results import StageResult, Times, dataset_hash, datasets, read_lock
 from loopwright.pipeline.tracking.store import store
 

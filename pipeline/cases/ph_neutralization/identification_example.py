@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.lagged.one_step import FORGETTING, OneStep, compare_one_step
 from loopwright.pipeline.models.part import Learnt, Part, Source
 from loopwright.pipeline.models.training.network_parts import trainer_of

@@ -21,16 +21,16 @@ from loopwright.pipeline.pictures.drawing import (
     axis_label,
     clear_legend,
     colour_of,
+    law_name,
     layer,
     legend_below,
+    number,
     scale,
     signal_label,
     symbol,
     time_axis,
 )
 from loopwright.pipeline.pictures.free_runs import free_run_picture
-from loopwright.pipeline.pictures.numbers import number
-from loopwright.pipeline.pictures.words import law_name
 
 LAWS = {
     "incremental network": NETWORK,

@@ -15,7 +15,7 @@ from loopwright.pipeline.evaluation.case import PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
 from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from loopwright.pipeline.plants.linearization import Linearization
+from loopwright.pipeline.plants.steady import Linearization
 
 # (C_A [mol/l], T [K]) at Tj = 250 K
 STEADY = ((0.07545, 376.27), (0.66613, 308.499), (0.98717, 271.66))

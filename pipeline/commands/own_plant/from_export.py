@@ -9,8 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from loopwright.pipeline.commands.own_plant.mv_limits import Widening
-from loopwright.pipeline.config.exports import ExportParams
-from loopwright.pipeline.config.intervals import Interval
+from loopwright.pipeline.config.exports import ExportParams, Interval
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.cleaning.findings import counted
 from loopwright.pipeline.historian.cleaning.tags import (

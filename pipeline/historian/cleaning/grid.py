@@ -12,7 +12,7 @@ from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.cleaning.sampling import Sampling, exact_step, row_numbers, sampling, whole_multiple
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.files.numbers import Codes
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.metrics import Array
 
 MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20

@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.config.intervals import Interval
+from loopwright.pipeline.config.exports import Interval
 from loopwright.pipeline.errors import RecordError, nearest
 from loopwright.pipeline.historian.cleaning.findings import Finding, counted
 from loopwright.pipeline.historian.cleaning.grid import Grid
@@ -19,7 +19,7 @@ from loopwright.pipeline.historian.cleaning.sampling import Sampling
 from loopwright.pipeline.historian.cleaning.tag_checks import VALVE_RANGE
 from loopwright.pipeline.historian.cleaning.tags import GUESSED_PAD, KEEP, Tag
 from loopwright.pipeline.historian.files.export import Export, Series
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import clipped, runs_of, stuck
 from loopwright.pipeline.historian.files.time_stamps import SINCE_1970_S, UNSTATED
 from loopwright.pipeline.metrics import Array

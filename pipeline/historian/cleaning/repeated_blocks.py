@@ -12,7 +12,7 @@ from loopwright.pipeline.historian.cleaning.findings import Finding, counted
 from loopwright.pipeline.historian.cleaning.tags import SIGNAL_ROLES, Tag
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.files.gathering import row_keys, with_the_same_stamps
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import noisy
 from loopwright.pipeline.metrics import Array
 

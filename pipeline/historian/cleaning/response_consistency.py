@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from loopwright.pipeline.historian.cleaning.findings import Finding, counted
 from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.tags import Tag
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import runs_of
 from loopwright.pipeline.metrics import Array
 

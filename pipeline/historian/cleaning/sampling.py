@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.files.export import Series
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import quantum, staircase
 from loopwright.pipeline.metrics import Array
 

@@ -16,7 +16,7 @@ from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.files.dialect import COMMA_DECIMAL, POINT_DECIMAL
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.files.numbers import loose_number
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import runs_of
 from loopwright.pipeline.metrics import Array
 

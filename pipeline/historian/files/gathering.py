@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.files.export import SENT_AGAIN, Series
 from loopwright.pipeline.historian.files.numbers import numbers
-from loopwright.pipeline.historian.files.quality import MOST_QUALITIES, meaning_of
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import MOST_QUALITIES, Reason, meaning_of
 from loopwright.pipeline.metrics import Array
 
 # ------------------------------------------------------------------------------------- rows that stand in a file again

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.files.headers import UNIT
-from loopwright.pipeline.historian.files.rejection_codes import Reason
+from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.metrics import Array
 
 EMPTY = ("", "nan", "null", "none", "na", "n/a", "#n/a", "#nv", "-", "--", "?", "<null>", "1.#qnan", "-1.#ind")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from loopwright.pipeline.errors import HostError
-from loopwright.pipeline.hosts.fmu.variables import Variable, variables_of
+from loopwright.pipeline.hosts.fmu.folder import Variable, variables_of
 from loopwright.pipeline.plants.fmu.description import described, fmpy
 from loopwright.pipeline.plants.fmu.instance import Instance
 from loopwright.serving.conformance.steps import answered

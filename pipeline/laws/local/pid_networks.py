@@ -13,9 +13,9 @@ from loopwright.pipeline.laws.base import require_kind
 from loopwright.pipeline.laws.local.local_controllers import BlendedParams, LocalControllers, LocalPid
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.local.local_models import LocalModels
-from loopwright.pipeline.plants.linearization import Linearization
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning.rules import AllPole
 
 DAMPING = 2.6  # of the triple of closed-loop poles: s^3 + 2.6 wc s^2 + 2.6 wc^2 s + wc^3

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.models.state_space.state_space import StateSpace
+from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.models.static.mlp import scaled_layers
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Array

@@ -27,11 +27,10 @@ from loopwright.pipeline.models.identified.model_validation import (
 from loopwright.pipeline.models.identified.network_search import UNITS
 from loopwright.pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from loopwright.pipeline.models.identified.parameter_uncertainty import colour_of, doubt_of, drawn
-from loopwright.pipeline.models.identified.regions import Cells
 from loopwright.pipeline.models.identified.residual_tests import residual_figures
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.steady_states import stability_figures
-from loopwright.pipeline.models.identified.structure import Problem, Structure
+from loopwright.pipeline.models.identified.structure import Cells, Problem, Structure
 from loopwright.pipeline.models.identified.structure_search import Searched, Selection, StructureSearch
 from loopwright.pipeline.models.identified.verdict import (
     STEP,
@@ -45,8 +44,7 @@ from loopwright.pipeline.models.identified.verdict import (
 )
 from loopwright.pipeline.models.part import Learnt, Part, Source
 from loopwright.pipeline.plants.simulator import Array
-from loopwright.pipeline.records.levels import levels_of, only_between
-from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.records.record import Record, levels_of, only_between
 from loopwright.serving.manifest import Signal
 
 Figures = Mapping[str, Mapping[str, Any]]

@@ -11,7 +11,7 @@ from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.identified.candidates import Start, Task
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.linear_start import within_unit_circle
-from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.structure import Structure, Trial
 
 MOST_STATES = 18

@@ -20,9 +20,8 @@ from loopwright.pipeline.historian.answers import DirectModel
 from loopwright.pipeline.historian.feedback import follows
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_start import high_order_arx
-from loopwright.pipeline.models.identified.regions import SMALL, Cells, alike, pieces
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from loopwright.pipeline.models.identified.structure import Problem, Structure, Trial
+from loopwright.pipeline.models.identified.structure import SMALL, Cells, Problem, Structure, Trial, alike, pieces
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 

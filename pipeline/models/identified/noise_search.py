@@ -14,7 +14,7 @@ from loopwright.pipeline.models.identified.assembly import step_responses
 from loopwright.pipeline.models.identified.candidates import Task
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
-from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.structure import Problem, Structure, Trial
 from loopwright.pipeline.tuning.responses import reached
 

@@ -13,10 +13,9 @@ from loopwright.pipeline.models.identified.candidates import RESTS, misses, rest
 from loopwright.pipeline.models.identified.knowledge import Knowledge
 from loopwright.pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from loopwright.pipeline.models.identified.measured_disturbances import Disturbances
-from loopwright.pipeline.models.identified.network_search import NetworkSearch
+from loopwright.pipeline.models.identified.network_search import NetworkSearch, Rounds
 from loopwright.pipeline.models.identified.noise_search import NATS, NETWORK_NATS, NoiseSearch, likely_dead_times, nats
 from loopwright.pipeline.models.identified.residual_tests import Drift, curved, drift_of
-from loopwright.pipeline.models.identified.rounds import Rounds
 from loopwright.pipeline.models.identified.scaled_record import (
     ScaledRecord,
     Scales,

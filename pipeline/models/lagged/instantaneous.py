@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.static.mlp import scaled_layers
-from loopwright.pipeline.models.training.jacobian import input_jacobian
+from loopwright.pipeline.models.training.objectives import input_jacobian
 
 
 class Linearized(NamedTuple):

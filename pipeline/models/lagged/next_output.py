@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from loopwright.pipeline.models.lagged.instantaneous import AlongMv
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.memory import Named, Slot, lag_slots, regressors
 
 

@@ -13,7 +13,7 @@ from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.metrics import fit_percent, rmse
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.lagged.nnarx import NNARX
+from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.lagged.one_step import FORGETTING, compare_one_step
 from loopwright.pipeline.models.part import Learnt, Part, Source, accuracy, predict
 from loopwright.pipeline.models.training.fit import FitHistory

@@ -10,8 +10,8 @@ import torch
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.lagged.instantaneous import linearize
-from loopwright.pipeline.models.lagged.nnarx import NNARX
-from loopwright.pipeline.models.lagged.recursive import RecursiveLeastSquares
+from loopwright.pipeline.models.lagged.lagged import NNARX
+from loopwright.pipeline.models.lagged.recursive_arx import RecursiveLeastSquares
 from loopwright.pipeline.models.training.regressors import nnarx_pairs
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record

@@ -15,8 +15,8 @@ from loopwright.pipeline.models.base import Model, simulate
 from loopwright.pipeline.models.local.local_models import LocalModels
 from loopwright.pipeline.models.part import Learnt, Part, Source
 from loopwright.pipeline.plants.equations import EquationPlant, equations
-from loopwright.pipeline.plants.linearization import Linearization
 from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.simulation.simulate import simulate_open
 
 STEADY_POINTS = 121  # MVs at which the network's steady state is compared with the plant's

@@ -15,10 +15,8 @@ from typing import final
 import numpy as np
 
 from loopwright.pipeline.errors import PlantError, nearest
-from loopwright.pipeline.plants.fmu.description import Description, Variable, described, fmpy
-from loopwright.pipeline.plants.fmu.instance import Instance
-from loopwright.pipeline.plants.fmu.memory import memory_of
-from loopwright.pipeline.plants.fmu.table import FmuTable
+from loopwright.pipeline.plants.fmu.description import Description, FmuTable, Variable, described, fmpy
+from loopwright.pipeline.plants.fmu.instance import Instance, memory_of
 from loopwright.pipeline.plants.program import Interface
 from loopwright.pipeline.plants.simulator import Array
 

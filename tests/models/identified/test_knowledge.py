@@ -11,8 +11,7 @@ import pytest
 from closed_loop_records import LOOPS, SIGNALS, OperatedLoop
 
 from loopwright.pipeline.config.known import stated
-from loopwright.pipeline.evaluation.known import known_rows
-from loopwright.pipeline.evaluation.proof import sign_doubts, statements
+from loopwright.pipeline.evaluation.proof import known_rows, sign_doubts, statements
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.knowledge import Knowledge, Pair

@@ -15,9 +15,9 @@ from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.knowledge import Knowledge, Pair
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
+from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.noise_search import NoiseSearch
 from loopwright.pipeline.models.identified.output_error import Fitted
-from loopwright.pipeline.models.identified.rounds import Rounds
 from loopwright.pipeline.models.identified.scaled_record import Fold
 from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure, Trial
 from loopwright.pipeline.models.part import Learnt, Source

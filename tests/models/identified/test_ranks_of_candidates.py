@@ -12,10 +12,9 @@ from loopwright.pipeline.models.identified.candidates import wild
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.linear_search import smallest_first
 from loopwright.pipeline.models.identified.linear_start import dead_times
-from loopwright.pipeline.models.identified.network_search import _offers
+from loopwright.pipeline.models.identified.network_search import Rounds, _offers
 from loopwright.pipeline.models.identified.noise_search import NoiseSearch
 from loopwright.pipeline.models.identified.output_error import Fitted
-from loopwright.pipeline.models.identified.rounds import Rounds
 from loopwright.pipeline.models.identified.scaled_record import Fold
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure, Trial
 from loopwright.pipeline.models.identified.structure_search import (

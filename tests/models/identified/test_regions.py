@@ -14,8 +14,8 @@ from closed_loop_records import OperatedLoop
 from loopwright.pipeline.evaluation.proof import sign_doubts, statements
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
-from loopwright.pipeline.models.identified.regions import Cells, alike, pieces
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
+from loopwright.pipeline.models.identified.structure import Cells, alike, pieces
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
 

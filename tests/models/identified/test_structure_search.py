@@ -13,7 +13,7 @@ import pytest
 from loopwright.pipeline.models.identified.candidates import on_all_rows
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
-from loopwright.pipeline.models.identified.rounds import Rounds
+from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.steady_states import INTEGRATES, slowest_pole
 from loopwright.pipeline.models.identified.structure import Budget, Structure, Trial
 from loopwright.pipeline.models.identified.structure_search import Searched

@@ -1,24 +1,125 @@
-"""Self-tuning PID after Cameron and Seborg: generalized minimum variance of an estimated predictor."""
+"""PIDs that adapt by a recursive linear model: gains by its gradient, and a self-tuning design."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor
 
-from loopwright.pipeline.laws.adaptive import signed_unit
-from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_single_loop
+from loopwright.pipeline.errors import LawError, ModelError
+from loopwright.pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, move, signed_unit, target
+from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
 from loopwright.pipeline.laws.gain_update import PidForm
-from loopwright.pipeline.laws.recursive.arx_law import estimator, require_arx
 from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.lagged.arx import ARX
+from loopwright.pipeline.models.lagged.lagged import ARX
+from loopwright.pipeline.models.lagged.recursive_arx import RecursiveArx, RecursiveLeastSquares
 from loopwright.pipeline.models.memory import Memory, Slot
 from loopwright.pipeline.plants.signals import Signals
 from loopwright.pipeline.plants.simulator import Simulator
+
+
+def require_arx(models: Mapping[str, Model], law: str) -> ARX:
+    """Part ``arx`` of a model set; raises LawError that says what the law needs and what the set has."""
+    model = require_kind(models, ARX, law)
+    if model.n_mv != 1 or model.delay != 1:
+        raise LawError(
+            f"law {law!r} needs a part 'arx' (kind arx, one MV, delay 1); "
+            f"the model set's has {model.n_mv} MVs and delay {model.delay}"
+        )
+    return model
+
+
+def estimator(
+    law: str, signals: Signals, model: ARX, unit: float, params: Any, prefilter: Sequence[float] = (), lags: int = 0
+) -> RecursiveArx:
+    """The model as a law learns it on, of at least ``lags`` of y, with ``unit`` [mv] from ``signed_unit``.
+
+    Raises LawError for wrong numbers.
+    """
+    try:
+        rls = RecursiveLeastSquares(params.forgetting, params.covariance)
+    except ModelError as error:
+        raise LawError(f"law {law!r}: {error}") from error
+    return RecursiveArx(model, signals.sp[0], signals.mv[0], unit, rls, prefilter, max(lags, model.n_y))
+
+
+class RecursivePid(AdaptivePid):
+    """PID whose gains give, within bounds, the minimum-variance move of a recursively estimated ARX model.
+
+        min_du  (r - y0 - b du)^2 + mu du^2   ->   v = b (r - y0)/c,   c = b^2 + mu
+        y0 = theta' x(t+1) with u(t) = u(t-1), plus d;   d = (1 - alpha) d1 + alpha (y - theta' x(t))
+
+    Recursive least squares with forgetting updates theta at this sample; part ``arx`` gives the
+    first estimate. Parameters and covariance are in the state. The estimate follows recent data
+    only, whereas ``linearized_pid`` has a model of the plant at the present operating point.
+
+    Source: REC-LINPID of [chen2004, section 5], with eqs 16-28 as its control law.
+    """
+
+    name: ClassVar[str] = "recursive_pid"
+    title: ClassVar[str] = "PID from a recursive linear model"
+    parts: ClassVar[Mapping[str, str]] = {"arx": "kind arx"}
+
+    @dataclass(frozen=True, slots=True)
+    class Params(AdaptiveParams):
+        """The settings of AdaptiveParams, and those of the estimator.
+
+        ``forgetting``: in (0, 1]. ``covariance``: its first and largest value, for scaled parameters
+        and signals. ``offset_filter``: alpha in [0, 1]; 0 means no offset d.
+        """
+
+        forgetting: float = 0.98
+        covariance: float = 1.0
+        offset_filter: float = 1.0
+
+        def __post_init__(self) -> None:
+            AdaptiveParams.__post_init__(self)
+            if not 0 <= self.offset_filter <= 1:
+                raise ValueError(f"offset_filter is {self.offset_filter}; it must lie in [0, 1]")
+
+    params: Params
+    penalty: Tensor  # (1,)
+    alpha: Tensor  # (1,) [pv]
+
+    def __init__(self, signals: Signals, model: ARX, params: Params) -> None:
+        def model_for(unit: float) -> RecursiveArx:
+            return estimator(self.name, signals, model, unit, params)
+
+        more = {"offset": Slot(1, torch.zeros(1, dtype=torch.float64))}
+        slopes = model.weight[: model.n_y], float(model.weight[model.n_y])
+        super().__init__(signals, params, -slopes[0], slopes[1], model_for, more, ("offset",))
+        hold_numbers(self, penalty=self.params.penalty, alpha=self.model.half_y * params.offset_filter)
+
+    @classmethod
+    def design(cls, params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None) -> Self:
+        """The law with part ``arx`` as its first estimate; raises LawError."""
+        return cls(signals, require_arx(models, cls.name), params)
+
+    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
+        """One step; shapes as in ControlLaw."""
+        p = self.memory.recall(sp, pv, mv_applied, state)
+        # What this sample teaches, and how far the model was off it.
+        sample = self.model.sample(p)
+        estimate = self.model(p, sample)
+        missed = sample.psi - self.model.output(sample.x, estimate.theta)
+        offset = (1 - self.params.offset_filter) * p["offset"] + self.alpha * missed
+        # The forecast without a move, and the move that brings it to the set point.
+        y = self.model.middle_y + self.model.pv_unit * self.model.output(sample.x_ahead, estimate.theta) + offset
+        slope = estimate.slope
+        c = slope * slope + self.penalty
+        best = slope * (target(p, self.params.preview) - y) / c
+        # The gains that come nearest to it, if they are free to change.
+        rho = self.gains.errors(p)
+        free, loud = self.gains.free(p, slope)
+        z, changed = self.gains.settled(p, self.gains.update(p, rho, best, c, free), free)
+        mv = self.limited(p["u"] + move(rho, z) * self.gains.unit, p["u"])
+        kept = {**estimate.kept, **loud, **changed, "offset": offset}
+        return mv, self.memory.stored(p, kept), torch.cat([self.gains.info_of(z, slope, free), offset], dim=-1)
+
 
 TERMS = 3  # of F: more would be no PID
 

@@ -14,9 +14,16 @@ from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.base import Model, simulate
 from loopwright.pipeline.models.part import Learnt, Part, Source, accuracy, predict
 from loopwright.pipeline.models.static.mlp import MLP
-from loopwright.pipeline.models.training.jacobian import input_jacobian, parameter_jacobian
 from loopwright.pipeline.models.training.network_parts import LongRun, fit_figures, fit_in_two, trainer_of
-from loopwright.pipeline.models.training.objectives import Rows, Samples, Sums, check_finite, chunks
+from loopwright.pipeline.models.training.objectives import (
+    Rows,
+    Samples,
+    Sums,
+    check_finite,
+    chunks,
+    input_jacobian,
+    parameter_jacobian,
+)
 from loopwright.pipeline.models.training.regressors import split_in_time
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record

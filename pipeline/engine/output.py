@@ -1,11 +1,14 @@
-"""The output of workers on the terminal, until a run is stopped."""
+"""Output of stages and workers on the terminal."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from typing import TextIO
 
 END_BYTES = 16  # drawn at random: no program writes them by chance
 NO_TEXT = b"\xff"  # begins the end: a byte of UTF-8 never has this value, so no text has to wait for what follows it
@@ -49,3 +52,53 @@ def _pass_on(source: int, to: int, stopped: threading.Event, end: bytes) -> None
 def _begun(text: bytes, end: bytes) -> int:
     """How many of the last bytes may be the beginning of the end."""
     return next((n for n in range(len(end) - 1, 0, -1) if text.endswith(end[:n])), 0)
+
+
+BARS = "LOOPWRIGHT_BARS"  # in the environment: somebody draws bars from marked lines of progress
+MARK = "\x02"  # begins such a line
+Listener = Callable[[str, str], None]  # (stdout or stderr, text)
+_listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
+class _Stream:
+    """A stream of this process that gives a thread's text to the thread's listener, if it has one."""
+
+    def __init__(self, name: str, own: TextIO) -> None:
+        self.name, self.own = name, own
+
+    def write(self, text: str) -> int:
+        listener = _listener.get()
+        if listener is None:
+            return self.own.write(text)
+        if text:
+            listener(self.name, text)
+        return len(text)
+
+    def flush(self) -> None:
+        if _listener.get() is None:
+            self.own.flush()
+
+    def isatty(self) -> bool:
+        return _listener.get() is None and self.own.isatty()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.own, name)
+
+
+def listen() -> None:
+    """Have this process's streams know of listeners; a second time changes nothing."""
+    for name in ("stdout", "stderr"):
+        own = getattr(sys, name)
+        if not isinstance(own, _Stream):
+            setattr(sys, name, _Stream(name, own))
+
+
+@contextlib.contextmanager
+def spoken_to(listener: Listener) -> Iterator[None]:
+    """Whatever this thread prints goes to ``listener``."""
+    listen()
+    token = _listener.set(listener)
+    try:
+        yield
+    finally:
+        _listener.reset(token)

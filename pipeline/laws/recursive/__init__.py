@@ -1,1 +1,0 @@
-"""Laws that go on learning a linear model in the loop. Its first training stands in ``models/lagged``."""

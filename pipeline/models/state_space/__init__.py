@@ -1,1 +1,0 @@
-"""State-space networks. Models of past outputs stand in ``lagged``."""
