@@ -13,7 +13,7 @@ from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
 from loopwright.pipeline.models.identified.output_error import OutputError, fit_starts
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, informative
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.manifest import Signal
 

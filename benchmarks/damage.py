@@ -27,8 +27,7 @@ from loopwright.pipeline.historian.screening import Screened, screened
 from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
 from loopwright.pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 from loopwright.pipeline.records.record import Record
 
 PAGE = Path("docs") / "damage.md"

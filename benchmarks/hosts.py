@@ -30,8 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from loopwright.serving import Controller, LoopwrightError
-from loopwright.serving.conformance.check import Verdict, check
-from loopwright.serving.conformance.kit import write_kit
+from loopwright.serving.conformance.kit import Verdict, check, write_kit
 
 ROOT = Path(__file__).resolve().parents[1]
 EMBED = ROOT / "examples" / "embed"

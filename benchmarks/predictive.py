@@ -20,13 +20,11 @@ from scipy.optimize import minimize
 
 from loopwright.pipeline.export.controller_file import export
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.models.identified.assembly import assembled, noise_of
-from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.identified import Identified, assembled, noise_of
 from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx, with_units
 from loopwright.pipeline.models.identified.output_error import OutputError, residuals
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.serving import Controller, Signal
 from loopwright.serving.card import bench

@@ -48,8 +48,7 @@ from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.pictures.drawing import png
 from loopwright.pipeline.pictures.loop_picture import RUN_DPI, History, draw, fewer_colours
 from loopwright.pipeline.pictures.screening_pictures import trends
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.report.screening import sayings, write_page
 from loopwright.pipeline.simulation.scenario import Scenario

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from loopwright.serving.arguments import Parser, write_any_text
 from loopwright.serving.card import bench, card, card_json, table
-from loopwright.serving.conformance.check import check
-from loopwright.serving.conformance.kit import VECTORS, write_kit
+from loopwright.serving.conformance.kit import VECTORS, check, write_kit
 from loopwright.serving.errors import LoopwrightError
 from loopwright.serving.signing import command as signing
 from loopwright.serving.trust import Controller

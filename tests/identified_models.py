@@ -8,7 +8,7 @@ import torch
 from loopwright.pipeline.models import Model
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.equations import EquationPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.simulate import simulate_open
 from loopwright.serving.manifest import Signal
 

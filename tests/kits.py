@@ -14,8 +14,7 @@ from typing import Any
 from shipped_files import SHIPPED
 
 from loopwright.serving import Controller
-from loopwright.serving.conformance.check import Verdict, check
-from loopwright.serving.conformance.kit import VECTORS, write_kit
+from loopwright.serving.conformance.kit import VECTORS, Verdict, check, write_kit
 
 ROOT = Path(__file__).resolve().parents[1]
 EMBED = ROOT / "examples" / "embed"

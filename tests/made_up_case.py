@@ -27,9 +27,8 @@ from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.validation import SCHEMA, Validation
 from loopwright.pipeline.evaluation.verdicts import PLAIN, Claims
 from loopwright.pipeline.export.controller_file import assembled, write_sidecar
-from loopwright.pipeline.report.for_programs import validation
 from loopwright.pipeline.report.page import write_report
-from loopwright.pipeline.report.verdicts import judge
+from loopwright.pipeline.report.verdicts import judge, validation
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from loopwright.serving.manifest import Manifest
 

@@ -14,7 +14,7 @@ from loopwright.pipeline.models import MODELS, Model
 from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.plants.equations import EquationPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.simulate import Trajectory
 from loopwright.serving.manifest import Signal
 

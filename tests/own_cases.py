@@ -13,7 +13,7 @@ from identified_models import scaled_model
 
 from loopwright.pipeline.cases.own_plant import OwnCase, own_case
 from loopwright.pipeline.laws import ControlLaw
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed

@@ -31,7 +31,7 @@ from loopwright.pipeline.models.static.leverage_domain import LeverageDomain
 from loopwright.pipeline.models.training.fit import LevenbergMarquardt
 from loopwright.pipeline.models.training.objectives import Samples
 from loopwright.pipeline.plants.equations import EquationPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import simulate_batch
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from loopwright.pipeline.export.controller_file import assembled, export, with_evidence
 from loopwright.pipeline.laws import ControlLaw
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving import Controller, Signal
 from loopwright.serving.controller_file import TRAILER_BYTES
 

@@ -19,8 +19,7 @@ from loopwright.pipeline.evaluation.evidence_basis import RecordVerdict
 from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
 from loopwright.pipeline.evaluation.one_side import before_turns, on_one_side
 from loopwright.pipeline.files import read_json
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.records.record_file import SetPoints
 from loopwright.pipeline.simulation.rests import courses, settled

@@ -14,8 +14,7 @@ from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant, longest_memory
 from loopwright.pipeline.plants.noise import deviation
 from loopwright.pipeline.plants.perturbed import SpoiltPlant, likely_error
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
 LEAST_GAIN, LEAST_PACE, LEAST_DEAD = 0.25, 0.25, 1.0

@@ -35,7 +35,7 @@ from loopwright.pipeline.evaluation.knowing_control import gets_there
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
 from loopwright.pipeline.metrics import mae
 from loopwright.pipeline.plants.identified import IdentifiedPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from loopwright.serving.manifest import Signal
 

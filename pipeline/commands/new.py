@@ -23,8 +23,15 @@ from loopwright.pipeline.commands.own_plant.from_simulator import (
     table_from,
     write_table,
 )
-from loopwright.pipeline.commands.own_plant.known_pairs import signals_as_tags, stated_of
-from loopwright.pipeline.commands.own_plant.mv_limits import check_commands, check_start, commanded, confirmed, mvs_of
+from loopwright.pipeline.commands.own_plant.knowledge import (
+    check_commands,
+    check_start,
+    commanded,
+    confirmed,
+    mvs_of,
+    signals_as_tags,
+    stated_of,
+)
 from loopwright.pipeline.commands.own_plant.printed import tell
 from loopwright.pipeline.commands.own_plant.replaced import (
     REFUSED,

@@ -21,8 +21,7 @@ from loopwright.pipeline.evaluation.evidence_basis import RecordVerdict
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
 from loopwright.pipeline.metrics import rmse
 from loopwright.pipeline.plants.equations import EquationPlant, equations
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario
 

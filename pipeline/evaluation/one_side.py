@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 
 LEAST = 0.1  # of the range that may be commanded, that a side must leave
 TURNS = 0.02  # of a curve's way, by which it comes back behind its turn: less is a curve that has become flat

@@ -11,8 +11,7 @@ import numpy as np
 from loopwright.pipeline.errors import PlantError, RecordError
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.metric import together
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import simulate_closed

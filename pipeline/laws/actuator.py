@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 
 Rates: TypeAlias = float | tuple[float | None, ...] | None
 """``mv_rate`` of a law [mv]: one number for all MVs, one for each with None for no limit, or None for none at all."""

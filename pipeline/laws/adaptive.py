@@ -15,7 +15,7 @@ from loopwright.pipeline.laws.base import ControlLaw, hold_numbers, require_sing
 from loopwright.pipeline.laws.gain_update import PidForm, gain_update
 from loopwright.pipeline.laws.scaled_defaults import OfRange, ascend, in_units
 from loopwright.pipeline.models.memory import Memory, Named, Slot
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 
 Three = tuple[float, float, float]
 CONFIDENCE = 0.99  # of the update criterion: noise alone triggers it in 1 % of the samples

@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.actuator import Rates, rates_of
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 
 M = TypeVar("M", bound=Model)
 Stepped: TypeAlias = tuple[Tensor, Tensor, Tensor]

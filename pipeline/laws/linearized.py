@@ -15,12 +15,10 @@ from loopwright.pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, move,
 from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
 from loopwright.pipeline.laws.scaled_defaults import OfRange, ascend, in_units
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.lagged.instantaneous import Arx, arx
+from loopwright.pipeline.models.lagged.instantaneous import Ahead, Arx, GaussNewton, NextOutput, arx
 from loopwright.pipeline.models.lagged.lagged import NNARX
-from loopwright.pipeline.models.lagged.next_output import Ahead, GaussNewton, NextOutput
 from loopwright.pipeline.models.memory import Memory, Named, Slot
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,7 @@ from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.lagged.lagged import ARX
 from loopwright.pipeline.models.lagged.recursive_arx import RecursiveArx, RecursiveLeastSquares
 from loopwright.pipeline.models.memory import Memory, Slot
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 
 
 def require_arx(models: Mapping[str, Model], law: str) -> ARX:

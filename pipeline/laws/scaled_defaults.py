@@ -6,7 +6,7 @@ from dataclasses import fields, replace
 from typing import Any, Self, TypeVar
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 
 P = TypeVar("P")
 

@@ -16,8 +16,7 @@ from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.metrics import per_region, r2, rmse
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.training.regressors import Pairs, forward_pairs, inverse_pairs
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.records.record import Record
 
 if TYPE_CHECKING:

@@ -7,8 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
-from loopwright.pipeline.evaluation.stress.draws import Draw
-from loopwright.pipeline.evaluation.stress.faults import STUCK
+from loopwright.pipeline.evaluation.stress.draws import STUCK, Draw
 from loopwright.pipeline.evaluation.stress.summary import Growth, Summary
 from loopwright.pipeline.pictures.drawing import STYLE, scale, signal_label, symbol, time_axis
 from loopwright.pipeline.plants.simulator import Array, Simulator

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import AdvanceMany, Array, Simulator
+from loopwright.pipeline.plants.simulator import AdvanceMany, Array, Signals, Simulator
 
 SETTLE = 2000
 """Periods that the plant is given to come to rest at its start; a slower one is brought there by Newton's method."""

@@ -1,18 +1,29 @@
-"""A plant as a closed loop needs it: signals, where it starts, one step, and what is measured."""
+"""The signals of a plant: all that reading a record, training a model and most laws need of it."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.plants.signals import Signals
 from loopwright.serving.manifest import Signal
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """Set points, process variables, measured disturbances, MVs, and the sampling period [s]."""
+
+    period_s: float
+    sp: tuple[Signal, ...]
+    pv: tuple[Signal, ...]  # controlled variables first
+    dv: tuple[Signal, ...]
+    mv: tuple[Signal, ...]
+
 
 Array = NDArray[np.float64]
 

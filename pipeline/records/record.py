@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 from loopwright.pipeline.records.record_file import Table, column_name, read_table, write_table
 from loopwright.serving.manifest import Signal
 

@@ -16,12 +16,11 @@ from loopwright.pipeline.evaluation.verdicts import Claims
 from loopwright.pipeline.optimal.bounds import bounded
 from loopwright.pipeline.pictures.drawing import CasePicture, law_name, number, ratio, scenario_name
 from loopwright.pipeline.report.figures import draw_all, main_words
-from loopwright.pipeline.report.for_programs import validation
 from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from loopwright.pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
 from loopwright.pipeline.report.own_acceptance import against, beyond_reach, shipped_laws, step_test_to_run
 from loopwright.pipeline.report.templating import REGISTRY_URL, render, write_pages
-from loopwright.pipeline.report.verdicts import BOUNDS, RULE, Judged, judge
+from loopwright.pipeline.report.verdicts import BOUNDS, RULE, Judged, judge, validation
 from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span
 from loopwright.pipeline.tuning.rules import PidSettings
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from loopwright.pipeline.evaluation.stress.draws import Draw
-from loopwright.pipeline.evaluation.stress.faults import KINDS, MOST_SPAN, MOST_ZERO, STROKE, STUCK_FOR
+from loopwright.pipeline.evaluation.stress.draws import KINDS, MOST_SPAN, MOST_ZERO, STROKE, STUCK_FOR, Draw
 from loopwright.pipeline.evaluation.stress.loops import Outcome, Stress
 from loopwright.pipeline.evaluation.stress.summary import QUANTILES, Summary, table
 from loopwright.pipeline.files import draft_of

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from loopwright.pipeline.cases import CASES
-from loopwright.pipeline.cases.reversible_cstr.reference_models import (
+from loopwright.pipeline.cases.reversible_cstr.pictures import (
     beats_the_classic_tables,
     reference_models_picture,
 )

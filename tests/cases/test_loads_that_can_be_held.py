@@ -14,7 +14,7 @@ from loopwright.pipeline.cases.operating_range import SCALES, Reach, held_at
 from loopwright.pipeline.cases.own_plant import GATE
 from loopwright.pipeline.cases.own_tests import ABOVE_NOISE, LEAST_LOAD, LOAD, held_load, load_size, whole_load
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.rests import courses
 from loopwright.serving.manifest import Signal
 

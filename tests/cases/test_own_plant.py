@@ -16,10 +16,10 @@ from loopwright.pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
 from loopwright.pipeline.cases.own_tests import LOAD
 from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
-from loopwright.pipeline.models.identified.assembly import remembering
 from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.identified import remembering
 from loopwright.pipeline.plants.perturbed import SpoiltPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.simulate import noise_draws, simulate_closed
 from loopwright.pipeline.tuning.responses import StepResponses

@@ -8,7 +8,7 @@ import pytest
 from loopwright.pipeline.cases.operating_range import Reach
 from loopwright.pipeline.cases.own_model import OwnPlant
 from loopwright.pipeline.plants.identified import IdentifiedArrays
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.manifest import Signal
 

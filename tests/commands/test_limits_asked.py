@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from loopwright.pipeline.commands.own_plant.mv_limits import confirmed
+from loopwright.pipeline.commands.own_plant.knowledge import confirmed
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.serving.manifest import Signal
 

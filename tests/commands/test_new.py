@@ -22,7 +22,7 @@ from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.config.exports import screened_record
 from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.files import sha256
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.stages.screen import screen
 from loopwright.serving.manifest import Signal

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.pipeline.evaluation.stress.faults import SLOW, SPAN, STUCK, ZERO, Actuators, Fault, draw_fault
+from loopwright.pipeline.evaluation.stress.draws import SLOW, SPAN, STUCK, ZERO, Actuators, Fault, draw_fault
 from loopwright.serving import Signal
 
 VALVE = (Signal("valve", "%", 0.0, 100.0),)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.evaluation.one_side import before_turns, on_one_side, side_of
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.manifest import Signal
 
 PV, MV = Signal("y", "K", 0.0, 100.0), Signal("u", "%", 0.0, 100.0)

@@ -10,7 +10,7 @@ import pytest
 
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.evaluation.open_loop import UNSEEN, replay
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.errors import LoopwrightError
 from loopwright.serving.manifest import Signal

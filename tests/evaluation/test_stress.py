@@ -17,8 +17,7 @@ from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.commands.stress import outcomes_of
 from loopwright.pipeline.engine.cluster import connected, local_cluster
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.evaluation.stress.draws import LATE, NOISE, Draw, Drawing
-from loopwright.pipeline.evaluation.stress.faults import KINDS, Actuators
+from loopwright.pipeline.evaluation.stress.draws import KINDS, LATE, NOISE, Actuators, Draw, Drawing
 from loopwright.pipeline.evaluation.stress.loops import Stress, advance_rows, swings
 from loopwright.pipeline.evaluation.stress.summary import Summary, table
 from loopwright.pipeline.export.controller_file import export

@@ -19,7 +19,7 @@ from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export import controller_file
 from loopwright.pipeline.export.controller_file import GATE_TOLERANCE, export, parity_gate, with_evidence
 from loopwright.pipeline.laws import ControlLaw
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving import Controller, Signal
 from loopwright.serving.conformance.steps import answered
 from loopwright.serving.controller_file import TRAILER_BYTES, file_digest

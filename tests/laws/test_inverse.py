@@ -14,7 +14,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.inverse.inverse import INC, INCAD, INCADEC
 from loopwright.pipeline.models import Model
 from loopwright.pipeline.models.static.leverage_domain import LeverageDomain
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 
 DV = torch.zeros(0, dtype=torch.float64)
 A, B, MIDDLE = 0.8, -1e-3, 250.0  # y(k+1) = A y(k) + B (mv(k) - MIDDLE) + disturbance; the second PV takes no part

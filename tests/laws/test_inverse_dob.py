@@ -11,7 +11,7 @@ from torch import Tensor
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.inverse.inverse_dob import ForwardDob, InverseDob, ObserverLaw, candidates
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.manifest import Signal
 
 PERIOD = 0.5

@@ -15,8 +15,8 @@ from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.excitation import EXCITATIONS
 from loopwright.pipeline.laws import LAWS as ALL
 from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.models.lagged.instantaneous import Ahead, GaussNewton, NextOutput
 from loopwright.pipeline.models.lagged.lagged import NNARX
-from loopwright.pipeline.models.lagged.next_output import Ahead, GaussNewton, NextOutput
 
 PH = PhNeutralizationCase()
 BATCH = BatchReactorCase()

@@ -13,12 +13,12 @@ from shipped import required
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws import LAWS, ControlLaw
+from loopwright.pipeline.laws.inverse.from_identified import CALM, CLEAR, Choice, linearized
 from loopwright.pipeline.laws.inverse.inverse_dob import ObserverLaw
-from loopwright.pipeline.laws.inverse.self_chosen import CALM, CLEAR, Choice, linearized
 from loopwright.pipeline.laws.suitability import require_fit
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.manifest import Signal
 
 NAMES = ["inverse_dob", "forward_dob"]

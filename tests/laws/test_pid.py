@@ -20,7 +20,7 @@ from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.models import Model
 from loopwright.pipeline.models.local.local_models import Linearized as LinearizedModel
 from loopwright.pipeline.plants.equations import EquationPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.simulate import simulate_closed
 from loopwright.pipeline.tuning.rules import AllPole, PidSettings, imc_pid, sampled_loop
 

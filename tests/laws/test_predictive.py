@@ -18,9 +18,8 @@ from torch import Tensor
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.export.controller_file import export
 from loopwright.pipeline.laws.predictive.disturbance_model import Where, loads_of
-from loopwright.pipeline.laws.predictive.horizon import horizon_of
+from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
 from loopwright.pipeline.laws.predictive.horizon_check import horizon_for, settling_times, step_responses
-from loopwright.pipeline.laws.predictive.move_blocking import Moves
 from loopwright.pipeline.laws.predictive.observer import (
     BOOST,
     CALMING,

@@ -13,8 +13,7 @@ from scipy.optimize import brentq
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.laws.predictive.disturbance_model import loads_of
-from loopwright.pipeline.laws.predictive.horizon import horizon_of
-from loopwright.pipeline.laws.predictive.move_blocking import Moves
+from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
 from loopwright.pipeline.laws.predictive.params import PredictiveParams, limits_of
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner

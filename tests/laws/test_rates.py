@@ -17,7 +17,7 @@ from loopwright.pipeline.export.controller_file import export
 from loopwright.pipeline.laws.actuator import Rates, rates_of
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.card import card
 from loopwright.serving.controller import Controller
 

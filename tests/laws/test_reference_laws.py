@@ -16,7 +16,7 @@ from loopwright.pipeline.cases.reversible_cstr.plant import ReversibleCstr
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
-from loopwright.pipeline.laws.reference.pi_reference import PiReference
+from loopwright.pipeline.laws.reference.reference_law import PiReference
 from loopwright.pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
 from loopwright.pipeline.laws.reference.reference_networks import (
     IncrementalNetwork,
@@ -27,7 +27,7 @@ from loopwright.pipeline.laws.reference.reference_networks import (
 from loopwright.pipeline.laws.reference.reference_training import follow, train
 from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.plants.equations import EquationPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
 from loopwright.pipeline.tuning.reference_model import ReferenceModel
 from loopwright.pipeline.tuning.rules import AllPole

@@ -20,7 +20,7 @@ from loopwright.pipeline.models import Model
 from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
 from loopwright.pipeline.models.local.local_models import LocalModels
 from loopwright.pipeline.models.static.mlp import MLP
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import simulate_closed
 from loopwright.serving.manifest import Signal

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from loopwright.pipeline.models.part import Groundwork, Source, done, groundworks
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.manifest import Signal
 
 Y, U = Signal("y", "m", 0.0, 1.0), Signal("u", "V", 0.0, 1.0)

@@ -15,7 +15,7 @@ from loopwright.pipeline.cases.own_plant import own_case
 from loopwright.pipeline.optimal import model_bounds as kept_bounds
 from loopwright.pipeline.optimal.model_bounds import SampledHorizon, model_bounds, run_sampled, shares, transition
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.serving.manifest import Signal
 

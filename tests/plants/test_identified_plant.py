@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.manifest import Signal
 
 LEVELS = (Signal("T", "degC", 0.0, 100.0), Signal("L", "m", 0.0, 4.0))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record, broken_run, position_in_run
 from loopwright.serving.manifest import Signal
 

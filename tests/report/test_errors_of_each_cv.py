@@ -15,10 +15,9 @@ from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
 from loopwright.pipeline.evaluation.validation import FILE
 from loopwright.pipeline.evaluation.verdicts import PLAIN
-from loopwright.pipeline.report.for_programs import validation
 from loopwright.pipeline.report.page import headline
 from loopwright.pipeline.report.results import show_results
-from loopwright.pipeline.report.verdicts import judge
+from loopwright.pipeline.report.verdicts import judge, validation
 
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")
 

@@ -26,10 +26,9 @@ from loopwright.pipeline.evaluation.verdicts import plain_reason
 from loopwright.pipeline.pictures.drawing import ratio
 from loopwright.pipeline.pictures.loop_picture import History, summary
 from loopwright.pipeline.pictures.loop_pictures import info_picture
-from loopwright.pipeline.report.for_programs import gate_id
 from loopwright.pipeline.report.page import headline
 from loopwright.pipeline.report.results import show_results
-from loopwright.pipeline.report.verdicts import judge, requirement, table_row
+from loopwright.pipeline.report.verdicts import gate_id, judge, requirement, table_row
 from loopwright.pipeline.tracking.card import version_description
 from loopwright.pipeline.tracking.gate import Gate
 

@@ -16,8 +16,7 @@ from kits import OLD
 
 from loopwright.serving import Controller, LoopwrightError
 from loopwright.serving.__main__ import main
-from loopwright.serving.conformance.check import check
-from loopwright.serving.conformance.kit import PASS, VECTORS, read, write_kit, written
+from loopwright.serving.conformance.kit import PASS, VECTORS, check, read, write_kit, written
 
 pytest_plugins = ["small_laws"]
 Capture = pytest.CaptureFixture[str]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.export.controller_file import export
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving import (
     ContractError,
     Controller,

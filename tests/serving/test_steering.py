@@ -25,7 +25,7 @@ from processes import within
 
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.export.controller_file import export
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving import Controller, LoopError, Mode
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.journal.entries import Entry

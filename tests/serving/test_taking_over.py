@@ -403,7 +403,7 @@ def test_others_that_do_not_fit_are_named(
 ) -> None:
     from small_laws import SIGNALS
 
-    from loopwright.pipeline.plants.signals import Signals
+    from loopwright.pipeline.plants.simulator import Signals
 
     others = {
         "its period is 1 s, the loop's is 0.5 s": replace(SIGNALS, period_s=1.0),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.rests import balanced, courses, local_gains, settled
 from loopwright.serving.manifest import Signal
 

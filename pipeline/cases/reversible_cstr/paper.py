@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from loopwright.pipeline.cases.reversible_cstr.case import NETWORK, ON_TEST, PI, PLAIN, PRINTED, PRINTED_SIGN, TUNED
+from loopwright.pipeline.cases.reversible_cstr.pictures import beats_the_classic_tables
 from loopwright.pipeline.cases.reversible_cstr.plant import R, ReversibleCstr
-from loopwright.pipeline.cases.reversible_cstr.reference_models import beats_the_classic_tables
 from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.closed_loop import overshoots
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError

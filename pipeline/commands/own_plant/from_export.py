@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
-from loopwright.pipeline.commands.own_plant.mv_limits import Widening
+from loopwright.pipeline.commands.own_plant.knowledge import Widening
 from loopwright.pipeline.config.exports import ExportParams, Interval
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.cleaning.findings import counted

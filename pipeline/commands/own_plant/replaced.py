@@ -11,7 +11,7 @@ from typing import Any
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.cases.own_entries import entries_of
 from loopwright.pipeline.commands.own_plant.from_simulator import SIMULATOR
-from loopwright.pipeline.commands.own_plant.known_pairs import Stated, checked
+from loopwright.pipeline.commands.own_plant.knowledge import Stated, checked
 from loopwright.pipeline.config.known import Known, together
 from loopwright.pipeline.config.params import read_section, sections
 from loopwright.pipeline.config.plants import PlantParams

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.evaluation.closed_loop import left_limits, locked_up, swings
-from loopwright.pipeline.evaluation.stress.draws import Draw, Drawing
-from loopwright.pipeline.evaluation.stress.faults import Actuators
+from loopwright.pipeline.evaluation.stress.draws import Actuators, Draw, Drawing
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.identified import IdentifiedPlant, StateEquation
 from loopwright.pipeline.plants.simulator import Array, Simulator

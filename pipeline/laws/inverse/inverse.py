@@ -14,8 +14,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_part, require_single_loop
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.static.leverage_domain import Interval, LeverageDomain
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 
 
 class INC(ControlLaw):

@@ -20,14 +20,12 @@ from loopwright.pipeline.laws.base import (
     require_part,
     require_single_loop,
 )
-from loopwright.pipeline.laws.inverse.learnt_parts import learnt_parts
-from loopwright.pipeline.laws.inverse.self_chosen import LONGEST, Choice
+from loopwright.pipeline.laws.inverse.from_identified import LONGEST, Choice, learnt_parts
 from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.static.mlp import MLP
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 
 
 def candidates(model: Model, x: Tensor, u: Tensor) -> Tensor:

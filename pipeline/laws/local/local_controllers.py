@@ -18,8 +18,7 @@ from loopwright.pipeline.laws.actuator import never_given, stood_still
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, hold_numbers, require_single_loop
 from loopwright.pipeline.models.local.local_models import LocalModels
 from loopwright.pipeline.plants.equations import EquationPlant, equations
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
 from loopwright.pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
 

@@ -18,8 +18,7 @@ from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require
 from loopwright.pipeline.laws.pid.tuned import by_simulation, given_pairs, linearization, require_numbers, tuned
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.equations import equations
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.tuning.loop_search import Loops
 from loopwright.pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, choice_words, pairings
 from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span

@@ -12,8 +12,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw, require_single_loop
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.equations import EquationPlant, equations
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning import rules
 from loopwright.pipeline.tuning.development import DevelopmentLoops

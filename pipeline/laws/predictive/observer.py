@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from loopwright.pipeline.laws.base import hold_numbers
 from loopwright.pipeline.laws.predictive.disturbance_model import Loads
 from loopwright.pipeline.laws.predictive.horizon import one_step, product
-from loopwright.pipeline.models.affine_map import AffineMap
 from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.memory import AffineMap
 
 NOISE_FLOOR = (
     1e-2  # scaled; a model that claims less noise would believe rounding, and lose the digits of its covariance

@@ -12,8 +12,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.actuator import Rates
 from loopwright.pipeline.laws.predictive.disturbance_model import Where
 from loopwright.pipeline.models.identified.identified import Identified
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 
 LONGEST = 500  # samples of a horizon: the law's graph and its design grow with each
 Limits = tuple[float | None, ...] | None

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
 from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, held_rest, loads_of
-from loopwright.pipeline.laws.predictive.horizon import horizon_of
+from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
 from loopwright.pipeline.laws.predictive.horizon_check import Sight, horizon_for, mvs_of, refuse_unstable
-from loopwright.pipeline.laws.predictive.move_blocking import Moves
 from loopwright.pipeline.laws.predictive.observer import Estimate, Noises, Observer, load_variance
 from loopwright.pipeline.laws.predictive.params import (
     PredictiveParams,
@@ -26,13 +25,11 @@ from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
 from loopwright.pipeline.laws.predictive.set_points import PRICE, SetPoints, SoftLimits
 from loopwright.pipeline.laws.predictive.tuning import Candidate, calmest, in_words, tuned
 from loopwright.pipeline.laws.predictive.tuning_loops import Trials
-from loopwright.pipeline.models.affine_map import AffineMap
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
-from loopwright.pipeline.models.memory import Named
+from loopwright.pipeline.models.memory import AffineMap, Named
 from loopwright.pipeline.plants.noise import level_gain
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 
 
 class Predictive(ControlLaw):

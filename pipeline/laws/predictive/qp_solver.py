@@ -10,8 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import hardtanh
 
 from loopwright.pipeline.laws.base import hold_numbers
-from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, NetworkHorizon, product
-from loopwright.pipeline.laws.predictive.move_blocking import Moves
+from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, NetworkHorizon, product
 from loopwright.pipeline.laws.predictive.set_points import SoftLimits
 
 

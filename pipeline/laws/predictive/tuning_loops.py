@@ -17,8 +17,7 @@ from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.identified import StateEquation, shift_rows
 from loopwright.pipeline.plants.noise import coloured, deviation
 from loopwright.pipeline.plants.perturbed import likely_error
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 
 M = TypeVar("M", bound=nn.Module)
 

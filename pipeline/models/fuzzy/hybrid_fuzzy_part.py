@@ -17,8 +17,7 @@ from loopwright.pipeline.models.base import Model, simulate
 from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
 from loopwright.pipeline.models.part import Learnt, Part, Source, predict
 from loopwright.pipeline.models.training.regressors import split_in_time
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.records.record import Record
 
 How = Literal["tied", "global", "local"]

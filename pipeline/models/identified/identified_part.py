@@ -10,10 +10,9 @@ import numpy as np
 
 from loopwright.pipeline.config.known import NONE
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.identified.assembly import assembled, noise_of
 from loopwright.pipeline.models.identified.candidates import on_all_rows, within_limits
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
-from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.identified import Identified, assembled, noise_of
 from loopwright.pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
 from loopwright.pipeline.models.identified.knowledge import known_figures
 from loopwright.pipeline.models.identified.model_validation import (

@@ -10,8 +10,8 @@ import numpy as np
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
-from loopwright.pipeline.models.identified.assembly import step_responses
 from loopwright.pipeline.models.identified.candidates import Task
+from loopwright.pipeline.models.identified.identified import step_responses
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
 from loopwright.pipeline.models.identified.network_search import Rounds

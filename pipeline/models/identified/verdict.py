@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.metrics import fit_percent
-from loopwright.pipeline.models.identified.assembly import dead_periods, step_responses
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.identified import dead_periods, step_responses
 from loopwright.pipeline.models.identified.innovations import AHEAD, Innovations, ahead
 from loopwright.pipeline.models.identified.output_error import fit_starts
 from loopwright.pipeline.models.identified.parameter_uncertainty import spread

@@ -8,8 +8,7 @@ from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.identified.output_error import fit_starts
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 
 
 def of_model(model: Identified) -> tuple[Dynamics, IdentifiedArrays]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.manifest import Signal
 

@@ -20,7 +20,7 @@ from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
 from loopwright.pipeline.models.identified.structure import Structure, Trial, best_of
 from loopwright.pipeline.models.part import Source
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
 
 QUICK = IdentifiedPart(minutes=0.2, orders=(2, 2), units=())
