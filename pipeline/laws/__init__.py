@@ -13,7 +13,7 @@ from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.laws.recursive import RecursivePid, SelfTuningPid
 from loopwright.pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
-from loopwright.pipeline.laws.reference.reference_law import PiReference
+from loopwright.pipeline.laws.reference.pi_reference import PiReference
 
 LAWS: dict[str, type[ControlLaw]] = {
     INC.name: INC,
