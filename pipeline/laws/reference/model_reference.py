@@ -22,8 +22,7 @@ from loopwright.pipeline.laws.reference.reference_networks import (
 )
 from loopwright.pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
 POINTS = 21  # of MV and CV each, at which the roots are looked for

@@ -14,8 +14,7 @@ from loopwright.pipeline.laws.reference.reference_law import ReferenceLaw, Refer
 from loopwright.pipeline.laws.reference.reference_networks import TrainablePi
 from loopwright.pipeline.laws.reference.reference_training import Trained, trained_policy, training_analysis
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.tuning.reference_model import ReferenceModel
 from loopwright.pipeline.tuning.rules import PidSettings
 

@@ -13,7 +13,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw, Stepped, require_single_loop
 from loopwright.pipeline.laws.reference.reference_loops import Training
 from loopwright.pipeline.models.memory import Named
-from loopwright.pipeline.plants.signals import Signals
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
 FOLLOWED = 0.01  # of the MV's range: an applied MV this close to the last request is the request

@@ -10,8 +10,7 @@ import numpy as np
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.models.static.mlp import scaled_layers
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 
 LONGEST, AT_REST = 20_000, 1e-10  # periods until a free run rests, and the relative change of a period that is rest
 CURVE = 200  # steady states, between which are drawn

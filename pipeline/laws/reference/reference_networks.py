@@ -15,10 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from loopwright.pipeline.models.affine_map import AffineMap
-from loopwright.pipeline.models.memory import Named
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.models.memory import AffineMap, Named
+from loopwright.pipeline.plants.simulator import Array, Signals
 
 R, Y, U, BEFORE, COURSE = 0, 1, 2, 3, 4  # columns of the inputs
 RANGE = 20.0  # of an exponent: beyond it a weight is nothing, or far too large

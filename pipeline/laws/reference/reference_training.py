@@ -17,8 +17,7 @@ from loopwright.pipeline.laws.reference.reference_networks import Trainable
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.models.training.objectives import input_jacobian
-from loopwright.pipeline.plants.signals import Signals
-from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.plants.simulator import Array, Signals
 from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
 P = TypeVar("P", bound=Trainable)
