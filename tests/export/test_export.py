@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime as ort
 import pytest
 import torch
 from quick_laws import STEPS_OF_GATE
+from shipped_files import SHIPPED
 from torch import Tensor
 
 from loopwright.pipeline.errors import ExportError
@@ -74,6 +76,48 @@ def test_python_floats_keep_their_53_bits(make_formula: MakeFormula, tmp_path: P
     expected = law(*(torch.tensor(v, dtype=torch.float64) for v in ([1e-6], [3.0], [], [0.0], [])))
     for ours, theirs in zip((step.mv, step.state, step.info), expected, strict=True):
         np.testing.assert_allclose(ours, theirs.numpy(), rtol=1e-15)
+
+
+def in_float32(file: Path, folder: Path) -> list[str]:
+    """Operators and constants of onnxruntime's own optimized graph that hold a float32 number."""
+    options, path = ort.SessionOptions(), folder / "optimized.onnx"
+    options.optimized_model_filepath, options.log_severity_level = str(path), 4
+    ort.InferenceSession(file.read_bytes()[:-TRAILER_BYTES], options, providers=["CPUExecutionProvider"])
+    graph = onnx.load(path).graph
+    found = [t.name for t in graph.initializer if t.data_type == onnx.TensorProto.FLOAT]
+    for node in graph.node:
+        found += [node.op_type for a in node.attribute if a.name == "alpha" and a.f != 1]
+        found += [node.op_type for a in node.attribute if a.name == "to" and a.i == onnx.TensorProto.FLOAT]
+    return found
+
+
+@pytest.mark.parametrize("n", [1, 3])
+@pytest.mark.parametrize("factor", [lambda x: 0.1 * x, lambda x: x / 0.7], ids=["times", "over"])
+@pytest.mark.parametrize("before", [False, True], ids=["behind", "before"])
+def test_no_factor_beside_a_product_becomes_float32(
+    make_formula: MakeFormula, tmp_path: Path, n: int, factor: Callable[[Tensor], Tensor], *, before: bool
+) -> None:
+    """onnxruntime fuses a factor of one element with a product, in an attribute of 24 bits."""
+    into, out = torch.linspace(-1.0, 1.3, n).double()[None], torch.linspace(0.2, 1.1, n).double()[:, None]
+
+    def formula(law: ControlLaw, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Any:
+        hidden = torch.tanh(1e-6 * sp) @ into + 0.0
+        y = factor(torch.tanh(hidden)) @ out if before else factor(torch.tanh(hidden) @ out)
+        return law.limited(mv_applied + torch.tanh(y), mv_applied), state, y
+
+    law, file = make_formula(formula, 0, ("y",), loop_signals()), tmp_path / "f.onnx"
+    export(law, file, case="none", provenance={})
+    assert in_float32(file, tmp_path) == []
+    sp = np.array([4e5])
+    wanted = law(*map(torch.from_numpy, (sp, np.zeros(1), np.zeros(0), np.zeros(1), np.zeros(0))))[2]
+    assert Controller(file).step(sp=sp, pv=0.0, mv_applied=0.0, state=[]).info == pytest.approx(
+        wanted.numpy(), rel=1e-14
+    )
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=lambda p: f"{p.parent.name}/{p.stem}")
+def test_shipped_graphs_stay_double(file: Path, tmp_path: Path) -> None:
+    assert in_float32(file, tmp_path) == []
 
 
 def test_graph_has_only_what_the_law_uses(make_formula: MakeFormula, tmp_path: Path) -> None:

@@ -210,9 +210,9 @@ def test_an_mv_that_was_not_obeyed_is_no_windup(model: NNARX) -> None:
 @pytest.mark.parametrize(
     ("params", "most"),
     [
-        ({}, 100),
-        (ADAPTIVE, 120),
-        ({**ADAPTIVE, "momentum": 0.4, "window": 5, "noise_variance": 1.0}, 150),
+        ({}, 125),
+        (ADAPTIVE, 155),
+        ({**ADAPTIVE, "momentum": 0.4, "window": 5, "noise_variance": 1.0}, 175),
     ],
 )
 def test_few_operators(model: NNARX, params: dict, most: int) -> None:
