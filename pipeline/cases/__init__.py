@@ -15,7 +15,8 @@ from loopwright.pipeline.cases.henson_seborg_cstr.case import HensonSeborgCstrCa
 from loopwright.pipeline.cases.jacketed_batch_reactor.case import JacketedBatchReactorCase
 from loopwright.pipeline.cases.own_plant import own_case
 from loopwright.pipeline.cases.own_simulator import simulated_case
-from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralization15sCase, PhNeutralizationCase
+from loopwright.pipeline.cases.ph_neutralization.case import PhNeutralizationCase
+from loopwright.pipeline.cases.ph_neutralization.case_15s import PhNeutralization15sCase
 from loopwright.pipeline.cases.reversible_cstr.case import ReversibleCstrCase
 from loopwright.pipeline.cases.thiosulfate_cstr.case import ThiosulfateCstrCase
 from loopwright.pipeline.config.params import PARAMS_FILE, sections

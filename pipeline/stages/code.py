@@ -188,9 +188,13 @@ def beside(case: str, name: str) -> str:
 
 
 def path_of(root: Path, module: str) -> Path:
-    """The file of a module, whether there or not; of a package its __init__.py."""
+    """The file of a module, whether there or not; of a package its __init__.py.
+
+    A folder of what Python compiled once is no package: a module may have taken its place since.
+    """
     path = root.joinpath(*module.split(".")[1:])  # the folders lie at the root
-    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    package, file = path / "__init__.py", path.with_suffix(".py")
+    return package if package.exists() or (path.is_dir() and not file.exists()) else file
 
 
 def _apart(stage: str, importer: str, imported: str) -> bool:

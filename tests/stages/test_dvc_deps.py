@@ -21,6 +21,7 @@ from loopwright.pipeline.stages.code import (
     graph,
     listing,
     modules,
+    path_of,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -127,3 +128,12 @@ def test_sources_of_another_folder_are_refused(tmp_path: Path) -> None:
         file.write("# edited\n")
     with pytest.raises(PipelineError, match="are not those that run"):
         check_sources(tmp_path)
+
+
+def test_a_folder_of_compiled_files_hides_no_module(tmp_path: Path) -> None:
+    """Git leaves it behind where a package became a module."""
+    (tmp_path / "pipeline/models/tank/__pycache__").mkdir(parents=True)
+    (tmp_path / "pipeline/models/tank.py").touch()
+    assert path_of(tmp_path, "loopwright.pipeline.models.tank") == tmp_path / "pipeline/models/tank.py"
+    (tmp_path / "pipeline/models/tank/__init__.py").touch()
+    assert path_of(tmp_path, "loopwright.pipeline.models.tank") == tmp_path / "pipeline/models/tank/__init__.py"

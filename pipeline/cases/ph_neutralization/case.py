@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization, PhNeutralization15s
+from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization
 from loopwright.pipeline.evaluation.case import Case, Curve, Figure, PaperFigure, PaperTable, Requirement
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.simulation.scenario import Scenario, from_rest, held, random_levels, stepwise
@@ -157,15 +157,3 @@ class PhNeutralizationCase(Case):
             # A third less buffer, a plant gain up by half: a loop without any reserve shows here.
             from_rest(self.plant, "less_buffer", "Buffer flow down", steps, hold=self.hold, changes={"q2": less}),
         )
-
-
-@dataclass(frozen=True)
-class PhNeutralization15sCase(PhNeutralizationCase):
-    """The paper does not print its period; its figures fit 60 s, and this shows what a shorter one gains."""
-
-    name: ClassVar[str] = "ph_neutralization_15s"
-    title: ClassVar[str] = "pH neutralization, sampled every 15 s"
-    plant_class: ClassVar[type[EquationPlant]] = PhNeutralization15s
-    tables: ClassVar[tuple[PaperTable, ...]] = ()
-    figures: ClassVar[tuple[Figure, ...]] = ()
-    requirements: ClassVar[tuple[Requirement, ...]] = ASKED_OF_THE_BEST
