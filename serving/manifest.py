@@ -12,13 +12,13 @@ from loopwright.serving.errors import ArtifactError
 from loopwright.serving.fields import MAX_DIGITS, refused, shown
 from loopwright.serving.words import ACTS
 
-SCHEMA = 1
+SCHEMA = 1  # of the manifest: a runtime refuses another
 MANIFEST_KEY = "loopwright.manifest"
 INPUTS = ("sp", "pv", "dv", "mv_applied", "state")
-MAX_CHARACTERS = 2**20
+MAX_CHARACTERS = 2**20  # of a manifest
 MAX_NAME = 200  # characters
 MAX_DEPTH = 20  # of lists and objects in each other
-MAX_STATE = 1_000_000
+MAX_STATE = 1_000_000  # numbers of a law's memory
 SHORTEST_S, LONGEST_S = 1e-6, 1e9  # a period
 SENSITIVE = "sensitive_after_steps"  # in the provenance: steps after which loops on two machines part by rounding
 MOVE_ROUNDING = 1e-9  # share of an MV's largest magnitude by which a sum of it and its max_move may be rounded

@@ -9,7 +9,7 @@ from loopwright.pipeline.cases.own_ensemble import LAW_PART, MODEL_SET
 from loopwright.pipeline.config.exports import ExportParams, screened_record
 from loopwright.pipeline.records.old_loops import OldController
 
-MEMBER_NUMBERS = (1, 2)
+MEMBER_NUMBERS = (1, 2)  # of the models beside the law's own, on which its tests run
 OLD_LOOP = "old_loop"
 """The plant's own controller, as its record shows it, among the controllers of params.yaml."""
 

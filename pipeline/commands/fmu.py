@@ -14,7 +14,7 @@ from loopwright.pipeline.hosts.fmu.folder import pack, write_folder
 from loopwright.pipeline.hosts.fmu.gate import check, problems
 from loopwright.serving.controller import Controller
 
-MEGABYTE = 1e6
+MEGABYTE = 1e6  # bytes
 
 
 def options(parser: argparse.ArgumentParser) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from loopwright.pipeline.config.params import choose
 
-WIDTH = 110
+WIDTH = 110  # letters of a line
 
 
 def list_or_show(table: Mapping[str, tuple[str, type[Any]]], name: str | None, what: str) -> None:

@@ -18,7 +18,7 @@ from loopwright.pipeline.playground.site import HOST, Playground, file_server, w
 from loopwright.pipeline.playground.web_runtime import web_runtime
 from loopwright.serving.controller import Controller
 
-PORT = 8123
+PORT = 8123  # of the page, where none is given
 ALL = "all"
 
 

@@ -14,7 +14,7 @@ from loopwright.serving.fields import MAX_DIGITS
 SECTIONS = ("cases", "exports", "records", "models", "plants", "controllers")
 OWN = "x-"  # a key that begins so is the user's, for values that aliases repeat
 MOST_VALUES = 1_000_000  # aliases counted as often as they stand for something
-MAX_DEPTH = 50
+MAX_DEPTH = 50  # lists and mappings within each other: a deeper file would exhaust the stack
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 ADDRESS = "DASK_SCHEDULER_ADDRESS"
 WORKERS = "LOOPWRIGHT_WORKERS"  # how many a cluster of this machine has where nobody says it; unset: one a core
-CONNECT_S = 20.0
+CONNECT_S = 20.0  # [s] until a scheduler must have answered
 WORKERS_S = 120.0  # for the first worker, whose libraries take some seconds
 # Set for the workers of a cluster of this machine: kinds of stages, with commas, that it is for. Unset: any may come.
 STAGES = "LOOPWRIGHT_STAGES"

@@ -20,7 +20,7 @@ from loopwright.pipeline.engine.fingerprint import commit, difference, fingerpri
 from loopwright.pipeline.engine.output import BARS
 from loopwright.pipeline.engine.stage_files import Folder, StageFiles, apply, read_files
 
-FAILED = 2
+FAILED = 2  # exit status of a stage that said why
 
 
 def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:

@@ -14,8 +14,8 @@ from loopwright.pipeline.evaluation.case import PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.validation import Statement
 
-RELATIVE = 0.25
-ABSOLUTE = 1e-4
+RELATIVE = 0.25  # of the paper's figure: a difference that still reproduces it
+ABSOLUTE = 1e-4  # in the figure's unit: the same for figures near zero
 
 
 @dataclass(frozen=True, slots=True)

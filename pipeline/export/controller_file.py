@@ -58,8 +58,8 @@ def write_sidecar(path: Path, manifest: Manifest) -> None:
     write_text(path.with_suffix(".json"), sidecar(manifest, file_digest(path.read_bytes())))
 
 
-GATE_STEPS = 1_000
-GATE_TOLERANCE = 1e-9
+GATE_STEPS = 1_000  # steps of the loop in which a law and its file are compared
+GATE_TOLERANCE = 1e-9  # largest difference of an MV or a state, relative to its largest value
 TOGETHER = 200  # steps of a law side by side: more would leave the caches
 INFO_TOLERANCE = 1e-6
 """Tolerance of info. It is shown and never fed back, so a difference cannot grow; but entries such as

@@ -17,7 +17,7 @@ from loopwright.pipeline.plants.equations import EquationPlant, rk4_step
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.graph.audit import MAX_IR
 
-OPSET = 18
+OPSET = 18  # as of a law's graph
 RUNS = "n"  # the first dimension of every input and output: runs side by side
 
 # Operations of CasADi that are one operator of ONNX; onnxruntime has each of them in float64.
@@ -211,7 +211,7 @@ def _size(function: ca.Function, what: str, sparsity: ca.Sparsity) -> int:
 
 # ----------------------------------------------------------------------------------------------- the graphs of a plant
 UNROLLED = 1_500  # operations above which the substeps are a loop: a runtime takes seconds to load thousands of nodes
-TOLERANCE = 1e-9
+TOLERANCE = 1e-9  # relative difference of a plant's graph and its equations
 MANIPULATED = ("x", "mv", "dv", "p")
 
 

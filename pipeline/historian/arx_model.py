@@ -13,13 +13,13 @@ from loopwright.pipeline.metrics import Array
 
 Blocks = tuple[tuple[int, int], ...]
 
-Y_LAGS = 3
+Y_LAGS = 3  # lags of the PV
 BLOCKS = ((0, 1), (1, 2), (2, 3), (3, 6), (6, 11), (11, 21), (21, 41))  # lags of an input that share a coefficient
 AHEAD = ((-1, 0), (-2, -1), (-5, -2))  # lags of an input that no plant can answer to
 MOST_ROWS, WINDOW_ROWS = 24_000, 2_000  # of the fit, in windows spread evenly over the record
 SETTLED = 0.8  # of the rows that an answer is followed: later it has not settled
 OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
-LEAST_ROWS = 60
+LEAST_ROWS = 60  # rows below which no model is fitted
 NO_EFFECT = 2.0  # strength of an input that a prediction leaves out
 RAMPS = 5.0  # likely errors of the sum of an input's coefficients, from which y integrates it
 LONG = 1_000_000  # rows, of which a part is looked at

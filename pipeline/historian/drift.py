@@ -29,7 +29,7 @@ from loopwright.pipeline.records.record import Record
 
 # --------------------------------------------------------- the part of a PV that the past of the inputs alone explains
 SLOW = ((41, 81), (81, 161), (161, 321))  # lags beyond BLOCKS that share a coefficient; the last are left out first
-SETTLED = 0.15
+SETTLED = 0.15  # of an answer's largest value: within it an answer has settled
 WEAK = 0.01  # part in the answer, over the strongest input's
 MOST_SHARE = 0.05  # of the rows: longer lags explain by chance what the inputs did not cause
 CHUNK = 200_000  # rows

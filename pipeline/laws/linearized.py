@@ -87,7 +87,7 @@ class NnarxPid(AdaptivePid):
         return (y - ahead.y - ahead.slope * move).abs()
 
 
-DOUBLINGS = 12
+DOUBLINGS = 12  # lengths of a step that are tried, each twice the one before
 
 
 class LinearizedPid(NnarxPid):

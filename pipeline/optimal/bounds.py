@@ -21,7 +21,7 @@ from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = dict[str, dict[str, dict[str, float]]]
-SCHEMA = 1
+SCHEMA = 1  # of the file: a reader refuses another
 DEFAULTS: dict[str, Any] = {
     "metric": "mae",
     "recipe": False,

@@ -26,7 +26,7 @@ HORIZON = (20, 60)  # least and most samples that a plan looks ahead
 EVERY = 4  # parts of the horizon: a plan is followed over one of them while its predictions come true
 CAME_TRUE = 1e-7  # scaled: how far a state may be from its prediction
 ARRIVED = 1e-4  # of the CVs' ranges: a plan whose error from here on is less is followed to its end
-MOST_ITERATIONS = 200
+MOST_ITERATIONS = 200  # of the solver at a sample
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.pictures.drawing import SIZE, STYLE, axis_label, legend_below, time_axis
 
-DAY_S = 86_400.0
+DAY_S = 86_400.0  # [s]
 TICKS = (4, 12)  # fewest and most
 
 
@@ -79,7 +79,7 @@ LINE = "#0072b2"
 POINTS = 3000  # of a line; more are drawn by their extremes
 PANEL, HEAD = 1.35, 1.0  # inches
 MOST_PANELS, MOST_DETAILS = 8, 6
-MOST_SPANS = 400
+MOST_SPANS = 400  # spans that are drawn: more would be a grey area
 AROUND, AROUND_SHARE = 25, 0.6  # rows beside a detail, or this share of its length
 
 

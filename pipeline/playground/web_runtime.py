@@ -24,7 +24,7 @@ DIGESTS = {
 }
 NPM = Path(__file__).parent / "npm"
 LICENCE = NPM / "onnxruntime-LICENSE"
-PATIENCE_S = 600.0
+PATIENCE_S = 600.0  # [s] that npm may take
 
 
 def kept() -> Path:

@@ -24,7 +24,7 @@ from loopwright.pipeline.report.verdicts import BOUNDS, RULE, Judged, judge, val
 from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span
 from loopwright.pipeline.tuning.rules import PidSettings
 
-MOST_HEADLINES = 5
+MOST_HEADLINES = 5  # rows at the head of a report
 
 
 def write_report(evidence: Evidence, claims: Claims, own: Sequence[CasePicture], out: Path) -> list[Path]:

@@ -19,7 +19,7 @@ from loopwright.pipeline.evaluation.validation import FILE, Validation
 from loopwright.pipeline.pictures.drawing import ratio
 from loopwright.pipeline.simulation import NOISE_SUFFIX
 
-WIDTH = 120
+WIDTH = 120  # letters of the table, where no terminal says how wide it is
 AHEAD = 0.99  # ratio to the bound below which a remark says why
 LONGEST_HEADS = 40  # letters of the names of laws side by side that a line of 80 has room for, beside the tests
 

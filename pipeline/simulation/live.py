@@ -19,8 +19,8 @@ from loopwright.pipeline.simulation.timetable import Timetable
 from loopwright.serving.guard import Sample
 from loopwright.serving.manifest import Signal
 
-WINDOW_S = 60.0
-WIDTH = 60
+WINDOW_S = 60.0  # [s] of the course that is shown
+WIDTH = 60  # letters of a course
 BARS = "▁▂▃▄▅▆▇█"
 Show = Callable[[float, str, Array, str, str | None], None]
 """``show(time_s, mode, values, reason, mark)`` shows one scan: set points, PVs and MVs in ``values``, what was wrong

@@ -17,7 +17,7 @@ from loopwright.pipeline.simulation.simulate import DV_DRAW, noise_draws
 from loopwright.serving.manifest import Signal
 
 SETTLE_SAMPLES = 80  # after the last event, where no duration was asked for
-MAX_SAMPLES = 10_000_000
+MAX_SAMPLES = 10_000_000  # of a simulation
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from loopwright.pipeline.plants.equations import equations
 from loopwright.pipeline.simulation.scenario import Scenario
 
 NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW for every further draw
-DRAW = 1_000
+DRAW = 1_000  # seeds between two draws of a test's noise
 
 
 @dataclass(frozen=True, slots=True)

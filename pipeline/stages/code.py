@@ -1,16 +1,18 @@
 """Stage code: ``python -m loopwright.pipeline.stages.code`` lists the files that every other stage runs.
 
 work/code/<stage>-<case>.json (<stage>.json of a stage over all cases) holds the sha256 of each file
-of ``pipeline`` and ``serving`` that the stage imports, at whatever depth; of the data files that dvc.yaml cannot list
-(exports, simulators); and the digest of what a report, or a stage of an own plant, reads of params.yaml beside its
-section. The stage depends on that
-one file, so an edit runs again what it has a part in and nothing else. One file for each stage keeps
+of ``pipeline`` and ``serving`` that the stage imports, at whatever depth, without its comments; of the data files that
+dvc.yaml cannot list (exports, simulators); and the digest of what a report, or a stage of an own plant, reads of
+params.yaml beside its section. The stage depends on that one file, so an edit runs again what it has a part in and nothing else. One file for each stage keeps
 dvc.lock short, which DVC reads and writes after every stage.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
 import sys
+import tokenize
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -115,11 +117,25 @@ def listing(root: Path, stage: str, case: str = "") -> dict[str, str]:
     bounds = path_of(root, beside(case, "bounds")).with_suffix(".json") if stage == "report" else root
     if bounds.is_file():
         files.add(bounds)
-    found = {p.relative_to(root).as_posix(): sha256(p) for p in sorted(files)}
+    found = {p.relative_to(root).as_posix(): _digest_of(p) for p in sorted(files)}
     data = _data_of(stage, case)
     found |= {p.as_posix(): sha256(root / p) if (root / p).is_file() else NO_FILE for p in data}
     read = _read_of(stage, case)
     return {**found, "params.yaml": digest(read)} if read else found
+
+
+def _digest_of(path: Path) -> str:
+    """sha256 of a file; of a Python file without its comments, which change no result."""
+    return _of_source(path.read_text(encoding="utf-8")) if path.suffix == ".py" else sha256(path)
+
+
+@cache  # most stages run most files
+def _of_source(source: str) -> str:
+    lines: list[str | None] = [*source.split("\n")]
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            lines[token.start[0] - 1] = token.line[: token.start[1]].rstrip() or None
+    return hashlib.sha256("\n".join(line for line in lines if line is not None).encode()).hexdigest()
 
 
 def _data_of(stage: str, case: str) -> tuple[Path, ...]:

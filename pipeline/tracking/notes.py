@@ -17,7 +17,7 @@ from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 from loopwright.pipeline.tracking.gate import Gate
 from loopwright.pipeline.tracking.stage_results import StageResult, Times, flat
 
-MOST = 12
+MOST = 12  # figures of a run: more would hide those that decide
 OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")
 POINTS = 200
 """Points of a curve; a training of thousands of iterations is thinned to these."""

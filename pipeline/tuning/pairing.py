@@ -15,7 +15,7 @@ from loopwright.serving.manifest import Signal
 Pairs = tuple[tuple[int, int], ...]
 """(CV, MV) of each loop, in the order of the MVs."""
 
-ONE_LOOP: Pairs = ((0, 0),)
+ONE_LOOP: Pairs = ((0, 0),)  # the pairing of one MV and one PV
 
 ALLOWED = "positive relative gains and a positive Niederlinski index"
 

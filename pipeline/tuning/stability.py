@@ -20,7 +20,7 @@ from loopwright.pipeline.tuning.development import LawStep
 
 SETTLING = 50  # steps at rest until a law's state no longer changes
 BISECTIONS = 9  # of the contraction rate: to within 0.2 % of the way to 1
-LARGEST_MARGIN = 100.0
+LARGEST_MARGIN = 100.0  # gain margin beyond which none is sought
 ROUNDING = 1e-9  # a verified contraction this far below 1 counts as one
 
 

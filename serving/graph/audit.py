@@ -15,7 +15,7 @@ from loopwright.serving.errors import ArtifactError
 from loopwright.serving.graph.onnx_bytes import Message, read_model
 from loopwright.serving.graph.work import BOOL, DOUBLE, ITEM_BYTES, MAX_WORK, RULES, Node, Value, results
 
-MAX_BYTES = 64 * 2**20
+MAX_BYTES = 64 * 2**20  # of a controller's file
 # onnxruntime simplifies a graph in a time that grows with the square of its operators: seconds for so many. The largest
 # law is the predictive one: 3,300 with the longest horizon that the work of a step allows, 2,700 with ten passes.
 MAX_NODES = 6_000

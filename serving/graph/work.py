@@ -20,7 +20,7 @@ Shape: TypeAlias = tuple[int, ...]
 
 FLOAT, INT32, INT64, BOOL, DOUBLE = 1, 6, 7, 9, 11  # TensorProto.DataType
 ITEM_BYTES = {FLOAT: 4, INT32: 4, INT64: 8, BOOL: 1, DOUBLE: 8}
-MAX_RANK = 8
+MAX_RANK = 8  # dimensions of a value
 # At most 200 ms of ordinary numbers and two seconds of subnormal ones. A predictive law has 1 to 2 million with one
 # loop, which take .2 ms, and up to 10 with three.
 MAX_WORK = 20_000_000

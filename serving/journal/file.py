@@ -9,7 +9,7 @@ from pathlib import Path
 
 from loopwright.serving.errors import LoopError
 
-SCHEMA = 2
+SCHEMA = 2  # of the file: a reader refuses another
 TABLES = """
 create table if not exists run (id integer primary key, began real not null, controller text not null,
     sha256 text not null, period_s real not null, speed real not null, columns text not null,

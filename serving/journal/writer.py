@@ -27,7 +27,7 @@ from loopwright.serving.manifest import Manifest
 from loopwright.serving.words import named
 
 EVENT_SHARE, EVENT_BYTES = 0.05, 400  # of the size for scans; of an event with its indexes
-LEAST_EVENTS = 1_000
+LEAST_EVENTS = 1_000  # events that a journal keeps, however small it is
 SLACK = 0.1  # of the events, by which there may be more until some go
 
 # Of each alarm its newest event, which says whether it is active; and the newest alarms that nobody has acknowledged.

@@ -16,13 +16,13 @@ from loopwright.serving.manifest import Manifest
 Range: TypeAlias = tuple[float, float]
 Kept: TypeAlias = Mapping[str, Range]
 
-ANY: Range = (-1e100, 1e100)
-POSITIVE: Range = (1e-100, 1e100)
+ANY: Range = (-1e100, 1e100)  # ends of a number that is kept
+POSITIVE: Range = (1e-100, 1e100)  # the same of a number above zero
 SIZE: Range = (0.0, 1e100)  # what cannot be negative
-COUNT: Range = (0, 10**12)
-SIGN: Range = (-1, 1)
+COUNT: Range = (0, 10**12)  # the same of a number of samples
+SIGN: Range = (-1, 1)  # the same of a direction
 TIME_S: Range = (0.0, 1e11)  # since 1970: to the year 5138
-LONGEST_LIST = 1_000
+LONGEST_LIST = 1_000  # entries of a list that is kept
 
 
 class Remembers:
@@ -145,7 +145,7 @@ Array: TypeAlias = NDArray[np.float64]
 SLACK = 1.0  # scatters by which a figure may lie off without a trace
 DOUBT = 0.05  # that what was learnt of any one of a chart's figures flatters
 OVERSHOOT = 1.166  # of a sum of normal figures over its limit, in scatters [Siegmund]
-LEAST_LIMIT = 4.0
+LEAST_LIMIT = 4.0  # standard deviations: a lower limit of a sum would alarm on noise
 LEAST_ROOT = 0.2  # of chi2 / nu: the approximation holds no further
 FEWEST = 3.0  # degrees of freedom that a scatter is believed to have at least
 WORTH, DOUBLINGS = 12.0, 2  # independent figures that learning needs; how often it may last twice as long for them

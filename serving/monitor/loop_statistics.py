@@ -162,7 +162,7 @@ class Foresight(Remembers):
 
 CROSSINGS = 20  # intervals between crossings that regularity needs: ten of noise and loads are regular by chance
 ORDER = 15  # of the error's autoregressive model
-LEAST = 1e-12
+LEAST = 1e-12  # smallest variance that is divided by
 
 
 class Swing(Remembers):

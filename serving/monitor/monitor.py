@@ -63,7 +63,7 @@ BLOCK = 10  # settling times: a block holds some moves of the set point
 FALSE_ALARMS = 0.25  # a week that are allowed to all charts together
 LEAST_DAY, MOST_DAY = 2_000, 200_000  # scans over which a share is taken
 BAND = 0.005  # of a set point's range: smaller errors are no swing
-HARRIS_SCANS = 500
+HARRIS_SCANS = 500  # scans that Harris's index is taken from
 NEAR_REST = 0.02  # of a set point's range: a mean error beyond is no rest
 
 

@@ -140,7 +140,7 @@ def _labels(labels: Mapping[str, Any]) -> str:
 # ------------------------------------------------------------------------------------------------------------ the page
 STATIC = Path(__file__).parent / "static"
 BODY_S = 5.0  # in which the body of a change must be here
-LONGEST_SPAN_S = 400 * 86_400.0
+LONGEST_SPAN_S = 400 * 86_400.0  # [s] of a trend that a browser may ask for
 TELL_S = 60.0  # between two lines about wrong tokens
 TRENDS, WAITING_TRENDS = 2, 10  # that are computed at a time, and that may wait for it
 TRENDS_LATER_S = 2  # after which a trend beyond them may be asked for again

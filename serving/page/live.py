@@ -24,7 +24,7 @@ MOST_PAGES = 60  # that are sent news at a time
 LATER_MS = 30_000  # after which a page beyond them may come again
 WAITING = 100  # messages that a page that takes none may leave
 MOST_SCANS = 2_000  # that fill a gap; beyond it the page asks for the trend anew
-ENTRIES = 200
+ENTRIES = 200  # of the journal that a page shows
 
 
 class Live:

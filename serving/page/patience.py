@@ -8,7 +8,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 REQUEST_S = 10.0  # in which a request's head must be here
 STALLED_S = 30.0  # in which an answer that is waiting must be taken
-MOST_CONNECTIONS = 200
+MOST_CONNECTIONS = 200  # browsers at once
 
 
 class Impatient(H11Protocol):

@@ -14,7 +14,7 @@ Array: TypeAlias = NDArray[np.float64]
 Piece: TypeAlias = tuple[Array, dict[str, Array], list[str]]  # times, columns, modes
 
 GAP = 5  # periods without a scan: a gap in the line
-MOST_POINTS = 2_000
+MOST_POINTS = 2_000  # of a curve: a screen has no more
 MOST_CHANGES = 4  # of the mode for each point: two rows a point are drawn whole, each with a gap before it
 MODES = ("", "AUTO", "SHADOW", "MANUAL", "HOLD")  # the last is what an operator must not miss
 

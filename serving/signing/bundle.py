@@ -18,9 +18,9 @@ from loopwright.serving.errors import SignatureError
 
 MEDIA_TYPE = "application/vnd.dev.sigstore.bundle.v0.3+json"
 PAYLOAD_TYPE = "application/vnd.in-toto+json"
-MAX_BYTES = 2**20
+MAX_BYTES = 2**20  # of a signature's file
 MAX_HINT = 200  # characters
-_SHOWN = 60
+_SHOWN = 60  # letters of a foreign text that a message shows
 
 
 @dataclass(frozen=True, slots=True)

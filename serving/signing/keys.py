@@ -21,7 +21,7 @@ except ModuleNotFoundError:
 
 Kind: TypeAlias = Literal["p256", "ed25519"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-MAX_BYTES = 16 * 2**10
+MAX_BYTES = 16 * 2**10  # of a key's file
 SHORT = 16  # digits of a fingerprint in a message
 _Public: TypeAlias = ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey
 _Private: TypeAlias = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey

@@ -18,7 +18,7 @@ from loopwright.serving.signing.reading import contents
 from loopwright.serving.signing.statement import Statement
 
 SUFFIX = ".sig"
-MAX_SIDECAR = 16 * 2**20
+MAX_SIDECAR = 16 * 2**20  # bytes of a manifest beside the file
 ENDS_SOON = timedelta(days=30)  # before a signature's end: the maker is asked for another one
 SLACK = timedelta(minutes=5)  # by which two clocks may differ
 

@@ -21,7 +21,7 @@ from loopwright.serving.words import first_line, named, plain
 Answer: TypeAlias = dict[str, Any]
 
 LONGEST = 100_000  # bytes of a request
-PATIENCE_S = 10.0
+PATIENCE_S = 10.0  # [s] that a request waits for its loop
 
 
 class Control:

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 Array: TypeAlias = NDArray[np.float64]
 
 POLL_S, SILENCE_S = 0.05, 1.0  # between two looks for the first values, and until it is said that there are none
-LONGEST_ANSWER_S = 5.0
+LONGEST_ANSWER_S = 5.0  # [s] that a request waits for the end of a scan
 
 
 class Station:

@@ -112,10 +112,11 @@ def test_an_edit_shows_in_the_stages_that_run_it_alone(tmp_path: Path) -> None:
         shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__"))
     before = {(s, c): listing(tmp_path, s, c) for s in STAGES if s != "screen" for c in CASES}
     assert before[("design", "batch_reactor")] == listing(ROOT, "design", "batch_reactor")
-    with (tmp_path / "pipeline" / "cases" / "batch_reactor" / "plant.py").open("a") as file:
-        file.write("# edited\n")
-    edited = {key for key in before if listing(tmp_path, *key) != before[key]}
-    assert edited == {key for key in before if key[1] == "batch_reactor"}
+    plant = tmp_path / "pipeline" / "cases" / "batch_reactor" / "plant.py"
+    for added, cases in (("# a comment\n", set()), ("EDITED = True  # and another\n", {"batch_reactor"})):
+        plant.write_text(plant.read_text() + added)
+        edited = {key for key in before if listing(tmp_path, *key) != before[key]}
+        assert edited == {key for key in before if key[1] in cases}
 
 
 def test_sources_of_another_folder_are_refused(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from manual.floors import contracts, floors
 from manual.laws import choice, facts, info_names, results
 from manual.markdown import code, prose, table
 from manual.parameters import parameters, whole
+from manual.thresholds import thresholds
 
 SECTIONS = {
     "cases": CaseParams,
@@ -102,6 +103,7 @@ GENERATED: dict[str, Callable[..., str]] = {
     "models": _models,
     "params": _params,
     "results": results,
+    "thresholds": thresholds,
     "validation": lambda: _file(Validation),
 }
 """Name -> function that gives Markdown; ``law`` and ``results`` take the law's name."""

@@ -73,7 +73,7 @@ def judged_record(
 SLOW, WANTED = 120, 60  # periods of the settling time: above the first, the period becomes long enough for the second
 LONGER = (10, 100, 1000)  # steps of a simulator in a period, tried where it does not settle
 RESTS_AFTER = (2, 8)  # settling times at an FMU's start values, tried where its start is no rest
-SEED = 0
+SEED = 0  # of the experiment
 SIMULATOR = "simulator"  # its copy beside the record, with the ending of the file
 
 

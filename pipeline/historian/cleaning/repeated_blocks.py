@@ -16,10 +16,10 @@ from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import noisy
 from loopwright.pipeline.metrics import Array
 
-FOLDS = (2, 2, 2, 3)
+FOLDS = (2, 2, 2, 3)  # factors of the rows that must repeat: keys of so many rows are made of keys of fewer
 WINDOW = math.prod(FOLDS)  # rows that must repeat
 DIFFERENT = 16  # changes of the value among them
-FACTOR = 0x9E3779B97F4A7C15
+FACTOR = 0x9E3779B97F4A7C15  # of the hash of a block: 2^64 over the golden ratio, which spreads keys evenly
 
 
 def drop_copies(own: Mapping[str, Series], tags: Sequence[Tag]) -> list[Finding]:

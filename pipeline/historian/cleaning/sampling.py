@@ -128,7 +128,7 @@ NICE_S = (
     *(0.01, 0.02, 0.05, 0.1, 0.2, 0.25, 0.5, 1, 2, 3, 4, 5, 6, 10, 12, 15, 20, 30),
     *(60, 120, 300, 600, 900, 1800, 3600),
 )
-HOLD_PERIODS = 3.2
+HOLD_PERIODS = 3.2  # periods for which a reading holds: three, and a little for jitter
 IRREGULAR = 2.5  # 90 % over 10 % quantile of the steps, above which a tag reports by exception
 EDGE = 0.35  # smallest moves over the median one, of a tag with a dead band
 RESTED, LONGEST, ON_TIME, FEWEST = 2.0, 0.999, 0.02, 15  # of the shortest step; of the longest; share of such; moves

@@ -23,6 +23,7 @@ from loopwright.pipeline.metrics import Array
 # -------------------------------- codes in place of a missing value: -9999 and its like, and the zero of a dead sensor
 Where = NDArray[np.bool_]
 
+# values that systems write for a reading that they lack
 CODES = (-9999.0, 9999.0, -999.0, -999.25, -99999.0, 99999.0, -999999.0, 32767.0, -32768.0, 65535.0, 2147483647.0)
 AWAY = 0.25  # spans of the usual values between them and zero, from which zero is a dead sensor
 FAR = 2.0  # spans of the usual values between them and a code

@@ -143,7 +143,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 # ------------------------------------------------------------------------------------------------------------ any file
 BLOCK_BYTES = 1 << 24
-BLOCK_ROWS = 1 << 17
+BLOCK_ROWS = 1 << 17  # rows that are read at once
 SPREAD = 1_000  # cells of a block
 PARQUET = {".parquet", ".pq"}
 

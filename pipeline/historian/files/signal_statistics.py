@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.metrics import Array
 
-SAMPLE = 50_000
+SAMPLE = 50_000  # readings that a column's character is taken from
 STUCK_CHANCE = 1e-4  # of a stretch as long by chance anywhere in the record
 SHORTEST_STUCK, LONGEST_STUCK = 8, 400  # rows
 NOISY = 0.2  # share of equal neighbours, up to which a value that repeats is a fault whatever the others do
 ALTERNATING = 0.6  # share of the second differences that change their sign, from which they are noise
 SEEN_MOVE, SEEN_STEPS = 0.05, 3  # of its span that another signal moves, and steps of the converter that this must be
-CLIPPED_ROWS = 5
+CLIPPED_ROWS = 5  # rows in a row at an end of the readings, from which on it is a range's end
 HELD = 0.6  # share of rows without a move, from which a signal is moved in steps
 LINEAR_ROWS = 5  # of a stretch that a compressed signal's interpolation makes straight
 

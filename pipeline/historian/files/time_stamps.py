@@ -34,7 +34,7 @@ from loopwright.pipeline.metrics import Array
 
 # --------------------------------------------------------------------------- the zone of local times, over summer time
 OFFSET = re.compile(r"^(?:UTC|GMT)?(?P<sign>[+-])(?P<hours>\d{1,2})(?::?(?P<minutes>\d\d))?$", re.IGNORECASE)
-HOUR_S = 3600.0
+HOUR_S = 3600.0  # [s] that a clock jumps by in spring and autumn
 SET_BACK_S = 600.0  # against the order of the file; less is disorder
 NO_CHANGES = np.zeros((0, 3))
 

@@ -18,8 +18,8 @@ NEAR = 0.02  # of J: what a number that is e times as large as at first costs, o
 COARSE = [(s, c) for s in (0.5, 1.0, 2.0) for c in (0.4, 1.0, 2.5)]  # factors of speed and caution
 FINE = [(s, c) for s in (0.7, 1.0, 1.4) for c in (0.6, 1.0, 1.6)]
 CALM = 0.05  # of the least error, that less travel may cost: a valve wears, and the model is not the plant
-HORIZONS = (0.7, 1.3)
-JUMPS = (0.3, 0.1, 0.03)
+HORIZONS = (0.7, 1.3)  # factors of the horizon that are tried
+JUMPS = (0.3, 0.1, 0.03)  # factors of the observer's jumps that are tried
 DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
 FORGETS = 100.0  # growth of a small difference up to which a loop forgets it; most stay below 20
 

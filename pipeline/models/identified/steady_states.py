@@ -19,7 +19,7 @@ INTEGRATES = 0.999
 STEP, LONG = 1e-3, 300
 """Step of an input, scaled, and the periods after it, in which a model that integrates shows which way it goes."""
 
-RESTS = 200
+RESTS = 200  # rows whose rests are sought
 SETTLE = 3000
 """Rests that the map is fitted to, and the most periods in which one is reached."""
 
