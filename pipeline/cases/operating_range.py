@@ -14,7 +14,7 @@ from loopwright.pipeline.evaluation.one_side import AWAY, BEYOND
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
-from loopwright.pipeline.simulation.rests import BALANCED, RESTING, balanced, courses, inside, settled
+from loopwright.pipeline.simulation.rests import BALANCED, RESTING, answered, balanced, courses, inside, settled
 from loopwright.serving.manifest import Signal
 
 VISITED_MV, VISITED_CV = (0.1, 0.9), (0.01, 0.99)  # quantiles of the record between which tests move
@@ -159,9 +159,8 @@ class Reach:
                 for end in ("low", "high")]  # fmt: skip
         mvs = np.vstack(ends)
         answer = RESTING if plant.foreseen is None else plant.foreseen + plant.most_dead_time
-        known = courses(plant, x, mvs, answer, p)[:, -1]
-        moved = np.abs(plant.measured(settled(plant, x, mvs, p)) - known)
-        return np.asarray(moved[:, : self.cv.shape[1]].max(axis=0))
+        known, rests = answered(plant, x, mvs, answer, p)
+        return np.asarray(np.abs(rests - known)[:, : self.cv.shape[1]].max(axis=0))
 
     def _begin(self, plant: Simulator) -> Array:
         """CVs (n_cv,) where a plant starts, within the visited range."""

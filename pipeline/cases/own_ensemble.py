@@ -22,7 +22,7 @@ from loopwright.pipeline.files import read_json
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.records.record_file import SetPoints
-from loopwright.pipeline.simulation.rests import courses, settled
+from loopwright.pipeline.simulation.rests import answered
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
@@ -148,17 +148,16 @@ class OwnEnsemble(Case):
         curves = [self._curves(path, values) for path in (self._law_file, *sorted(self.models.glob(MEMBERS)))]
         reached, rests = np.stack(curves, axis=1)
         visited = float(max(low, mv.low)), float(min(high, mv.high))
-        return before_turns(found, values, reached, visited, rests)
+        return before_turns(found, values, reached, rests, visited)
 
     def _curves(self, path: Path, values: Array) -> Array:
         """The CV (2, n) that a model reaches from its rest under MVs (n,): when its answer is known, and in the end."""
         plant = self._over(self.signals, path, visited_mv(self.record, self.signals.mv)[1])
         (signal,), (start, _) = plant.sp_signals, plant.start
-        known = courses(plant, start, values[:, None], plant.foreseen)[:, -1, 0]
-        rests = plant.measured(settled(plant, start, values[:, None]))[:, 0]
+        known, rests = answered(plant, start, values[:, None], plant.foreseen)
         span = signal.high - signal.low
         # No record knows of curves out there.
-        return np.asarray(np.clip([known, rests], signal.low - span, signal.high + span))
+        return np.asarray(np.clip([known[:, 0], rests[:, 0]], signal.low - span, signal.high + span))
 
     @property
     def same_row(self) -> bool:

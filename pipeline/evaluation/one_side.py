@@ -40,13 +40,11 @@ def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Si
     return _within(signals, low, high)
 
 
-def before_turns(
-    signals: Signals, values: Array, curves: Array, visited: tuple[float, float], rests: Array | None = None
-) -> Signals:
+def before_turns(signals: Signals, values: Array, curves: Array, rests: Array, visited: tuple[float, float]) -> Signals:
     """The signals of a plant of one MV, whose range ends where a model of the record turns first, or does not rest.
 
     ``curves`` (models, n) are what the models' CV reaches under rising values (n,) of the MV as far as the answer is
-    known, ``rests`` (models, n) long after (None: the same). The ``visited`` part (lowest, highest) remains: there the
+    known, ``rests`` (models, n) long after. The ``visited`` part (lowest, highest) remains: there the
     record judges, see ``on_one_side``. Outside of it nobody knows whether the turn is the plant's, but a law on that
     model locks up behind it; and so it does where the model leaves what it had reached.
     """
@@ -54,7 +52,7 @@ def before_turns(
     first, last = max(min(first, middle - 1), 0), min(max(last, middle + 1), len(values) - 1)
     rising = curves * np.sign(curves[:, [last]] - curves[:, [first]])
     way = np.ptp(curves, axis=1)
-    on = np.zeros(curves.shape) if rests is None else np.abs(rests - curves)
+    on = np.abs(rests - curves)
     # What a slow model still has to go grows with the move.
     half = 0.5 * (values[last] - values[first])
     farther = np.maximum(1.0, np.abs(values - 0.5 * (values[last] + values[first])) / half)

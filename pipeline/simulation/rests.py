@@ -47,6 +47,15 @@ def settled(plant: Simulator, x0: Array, mvs: Array, p: Array | None = None) -> 
     return x
 
 
+def answered(plant: Simulator, x0: Array, mvs: Array, n: int, p: Array | None = None) -> tuple[Array, Array]:
+    """PVs (runs, n_pv) ``n`` periods after a move from x0 to constant mvs (runs, n_mv), and in the end.
+
+    ``n`` are the periods over which the answer is known: a plant that settles has no farther to go, and a model that
+    runs away from its record has.
+    """
+    return courses(plant, x0, mvs, n, p)[:, -1], plant.measured(settled(plant, x0, mvs, p))
+
+
 def _bounded(before: Array, after: Array) -> Array:
     good = np.all(np.abs(after) < BROKEN, axis=-1, keepdims=True)
     return after if good.all() else np.where(good, after, before)

@@ -3,8 +3,8 @@
 work/code/<stage>-<case>.json (<stage>.json of a stage over all cases) holds the sha256 of each file
 of ``pipeline`` and ``serving`` that the stage imports, at whatever depth, without its comments; of the data files that
 dvc.yaml cannot list (exports, simulators); and the digest of what a report, or a stage of an own plant, reads of
-params.yaml beside its section. The stage depends on that one file, so an edit runs again what it has a part in and nothing else. One file for each stage keeps
-dvc.lock short, which DVC reads and writes after every stage.
+params.yaml beside its section. The stage depends on that one file, so an edit runs again what it has a part in and
+nothing else. One file for each stage keeps dvc.lock short, which DVC reads and writes after every stage.
 """
 
 from __future__ import annotations

@@ -81,12 +81,13 @@ def test_an_mv_ends_at_the_first_turn_of_a_model_and_keeps_what_was_visited() ->
         ([-((u - 70.0) ** 4)], (0.0, 70.0)),  # it falls farther behind its top than it rose before it
         ([np.interp(u, [0, 60, 80, 100], [0, 60, 20, 70])], (0.0, 60.0)),  # the first turn
     ]:
-        found = before_turns(ONE, u, np.array(curves), (30.0, 60.0)).mv[0]
+        found = before_turns(ONE, u, np.array(curves), np.array(curves), (30.0, 60.0)).mv[0]
         assert (found.low, found.high) == ends
     for visited, ends in [((75.0, 95.0), (0.0, 100.0)), ((0.0, 100.0), (0.0, 100.0))]:  # flat is flat from anywhere
-        found = before_turns(ONE, u, np.array([flat]), visited).mv[0]
+        found = before_turns(ONE, u, np.array([flat]), np.array([flat]), visited).mv[0]
         assert (found.low, found.high) == ends
-    assert before_turns(ONE, u, np.array([hill]), (50.2, 50.2)).mv[0].high == 70.0  # an MV that rested
+    rested = before_turns(ONE, u, np.array([hill]), np.array([hill]), (50.2, 50.2)).mv[0]
+    assert rested.high == 70.0
 
 
 def test_an_mv_ends_where_a_model_leaves_what_it_had_reached() -> None:
@@ -100,9 +101,9 @@ def test_an_mv_ends_where_a_model_leaves_what_it_had_reached() -> None:
         ([falls, slow], (0.0, 100.0)),
         ([falls, runs + 20.0], (0.0, 100.0)),  # it does so where the record judges, too
     ]:
-        found = before_turns(ONE, u, np.array([falls, falls]), (30.0, 60.0), np.array(rests)).mv[0]
+        found = before_turns(ONE, u, np.array([falls, falls]), np.array(rests), (30.0, 60.0)).mv[0]
         assert (found.low, found.high) == ends
-    slow = before_turns(ONE, u, np.array([0.7 * (u - 50.0)]), (45.0, 55.0), np.array([u - 50.0])).mv[0]
+    slow = before_turns(ONE, u, np.array([0.7 * (u - 50.0)]), np.array([u - 50.0]), (45.0, 55.0)).mv[0]
     assert (slow.low, slow.high) == (0.0, 100.0)
-    visited = before_turns(ONE, u, np.array([falls]), (7.5, 60.0), np.array([runs])).mv[0]
+    visited = before_turns(ONE, u, np.array([falls]), np.array([runs]), (7.5, 60.0)).mv[0]
     assert visited.low == 7.5  # what was visited remains
