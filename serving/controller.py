@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
-from collections.abc import Callable
 from contextlib import suppress
 from math import inf, isfinite
 from os import PathLike
@@ -16,9 +14,9 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.controller_file import DIGEST_KEY, file_digest, unseal
+from loopwright.serving.controller_file import DIGEST_KEY, file_digest, read_controller
 from loopwright.serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
-from loopwright.serving.graph.audit import MAX_BYTES, audit
+from loopwright.serving.graph.audit import audit
 from loopwright.serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
 from loopwright.serving.ranges import numbers
 
@@ -96,7 +94,7 @@ class Controller:
     def __init__(self, path: str | PathLike[str], sha256: str | None = None) -> None:
         self.path = Path(path)
         try:
-            data = _read(self.path, sha256)
+            data = read_controller(self.path, sha256)
             self.summary = audit(data)
             self.manifest = _manifest(self.summary.metadata)
             self._session = _session(data)
@@ -305,48 +303,6 @@ def _vectors(lengths: list[int]) -> tuple[Array, list[Array]]:
     whole = raw[first : first + sum(lines) * _LINE]
     starts = np.cumsum([0, *lines]) * _LINE
     return whole, [whole[s : s + n] for s, n in zip(starts, lengths, strict=False)]
-
-
-def _read(path: Path, pinned: str | None) -> bytes:
-    """The file's bytes, read once: what is checked is what is loaded."""
-    try:
-        _check_kind(path.stat())  # before it is opened: opening a device may already do something
-        with open(path, "rb", opener=_without_waiting) as file:
-            info = os.fstat(file.fileno())
-            _check_kind(info)
-            data = file.read(info.st_size)
-    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
-        raise ArtifactError(f"the file cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    if pinned is not None and file_digest(data) != pinned.lower():
-        raise ArtifactError(
-            f"the file's SHA-256 is {file_digest(data)}, not the pinned {pinned}; "
-            "pin this one only if you changed the file yourself"
-        )
-    unseal(data)
-    return data
-
-
-def _check_kind(info: os.stat_result) -> None:
-    """ArtifactError unless it is a regular file of at most MAX_BYTES: a pipe or a device may never end."""
-    if not stat.S_ISREG(info.st_mode):
-        kind = next((word for is_kind, word in _KINDS if is_kind(info.st_mode)), "no regular file")
-        raise ArtifactError(f"the path is {kind}; a controller is a regular file")
-    if info.st_size > MAX_BYTES:
-        raise ArtifactError(f"the file has {info.st_size} bytes; a controller has at most {MAX_BYTES}")
-
-
-_KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
-    (stat.S_ISDIR, "a directory"),
-    (stat.S_ISFIFO, "a pipe"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-)
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a path; a pipe without a writer, put in the file's place since it was checked, does not block."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _manifest(metadata: dict[str, str]) -> Manifest:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import stat
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -92,3 +95,49 @@ def _differs(found: Any, wanted: Any, where: str) -> str:
     else:
         return "" if found == wanted and isinstance(found, bool) == isinstance(wanted, bool) else where or "the whole"
     return next(filter(None, (_differs(f, w, f"{where}.{key}".lstrip(".")) for key, f, w in pairs)), "")
+
+
+# ------------------------------------------------------------------------------------------------- reading a file
+def read_controller(path: Path, pinned: str | None) -> bytes:
+    """The bytes of a controller's file, read once: what is checked is what is loaded.
+
+    ArtifactError for what is no regular file, is too large, is damaged, or has another SHA-256 than the ``pinned`` one.
+    """
+    try:
+        _check_kind(path.stat())  # before it is opened: opening a device may already do something
+        with open(path, "rb", opener=without_waiting) as file:
+            info = os.fstat(file.fileno())
+            _check_kind(info)
+            data = file.read(info.st_size)
+    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
+        raise ArtifactError(f"the file cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if pinned is not None and file_digest(data) != pinned.lower():
+        raise ArtifactError(
+            f"the file's SHA-256 is {file_digest(data)}, not the pinned {pinned}; "
+            "pin this one only if you changed the file yourself"
+        )
+    unseal(data)
+    return data
+
+
+def _check_kind(info: os.stat_result) -> None:
+    """ArtifactError unless it is a regular file of at most MAX_BYTES: a pipe or a device may never end."""
+    if not stat.S_ISREG(info.st_mode):
+        kind = next((word for is_kind, word in _KINDS if is_kind(info.st_mode)), "no regular file")
+        raise ArtifactError(f"the path is {kind}; a controller is a regular file")
+    if info.st_size > audit.MAX_BYTES:
+        raise ArtifactError(f"the file has {info.st_size} bytes; a controller has at most {audit.MAX_BYTES}")
+
+
+_KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
+    (stat.S_ISDIR, "a directory"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def without_waiting(path: str, flags: int) -> int:
+    """Open a path, for ``open``; a pipe without a writer does not block: it may have been put there since a check."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))

@@ -6,6 +6,7 @@ import os
 import stat
 from pathlib import Path
 
+from loopwright.serving.controller_file import without_waiting
 from loopwright.serving.errors import SignatureError
 
 
@@ -15,7 +16,7 @@ def contents(path: Path, most: int) -> bytes:
     Raises SignatureError for anything else: a pipe would be waited for, and a device may never end.
     """
     try:
-        with open(path, "rb", opener=_without_waiting) as file:
+        with open(path, "rb", opener=without_waiting) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
                 raise SignatureError(f"{path} is no regular file")
             data = file.read(most + 1)
@@ -26,8 +27,3 @@ def contents(path: Path, most: int) -> bytes:
     if len(data) > most:
         raise SignatureError(f"{path} has more than the {most} bytes that it may have")
     return data
-
-
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a path; a pipe without a writer does not block."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
