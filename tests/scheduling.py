@@ -38,7 +38,7 @@ LONG = (
     *("test_laws_contract.py", "test_pipeline.py", "test_real_servers.py", "test_drifts_of_every_case.py"),
     *("test_screen_by_dvc.py", "test_export_to_controller.py", "test_identified_part.py"),
     *("test_new.py", "test_tracking.py", "test_embed.py", "test_predictive.py", "test_manual_builds.py"),
-    *("test_c_host.py", "test_cluster_stages.py", "test_cluster.py", "test_node_host.py"),
+    *("test_fusion.py", "test_c_host.py", "test_cluster_stages.py", "test_cluster.py", "test_node_host.py"),
     *("test_laws_that_are_refused.py", "test_controller_fmu.py", "test_report.py", "test_graph_audit.py"),
     *("test_report_of_squared_errors.py", "test_fuzzy_laws.py", "test_commanded_mvs.py", "test_screen.py"),
     *("test_pictures.py", "test_structure_search.py", "test_units_of_laws.py", "test_repeatable.py"),

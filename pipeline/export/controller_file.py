@@ -14,6 +14,7 @@ import torch
 
 from loopwright.pipeline.engine import progress
 from loopwright.pipeline.errors import ExportError
+from loopwright.pipeline.export.fusion import fused
 from loopwright.pipeline.export.graph import check_operators, example_inputs, law_graph
 from loopwright.pipeline.files import draft_of, write_text
 from loopwright.pipeline.laws.base import ControlLaw
@@ -78,9 +79,10 @@ def export(
 ) -> Manifest:
     """Write ``law`` as one ONNX graph with its manifest, and the manifest again as .json beside it.
 
-    The graph is written to a draft. The draft is loaded by the runtime that will serve it, and renamed only after each
-    of 1,000 steps of a closed loop agrees with the torch module, see ``parity_gate``. Where the loop amplifies
-    rounding, the manifest's provenance says after how many steps two machines part, ``sensitive_after_steps``.
+    The graph is fused, see ``loopwright.pipeline.export.fusion``, and written to a draft. The draft is loaded by the
+    runtime that will serve it, and renamed only after each of 1,000 steps of a closed loop agrees with the torch
+    module, see ``parity_gate``. Where the loop amplifies rounding, the manifest's provenance says after how many steps
+    two machines part, ``sensitive_after_steps``.
 
     Parameters
     ----------
@@ -105,7 +107,8 @@ def export(
     path = Path(path)
     law = law.eval()
     _check_shapes(law)
-    model, inputs = law_graph(law)
+    written, inputs = law_graph(law)
+    model = fused(written)
     check_operators(law, model)
     manifest = Manifest(
         **{name: getattr(law.signals, name) for name in ("period_s", "sp", "pv", "dv", "mv")},

@@ -287,44 +287,6 @@ def _simplify(model: ir.Model) -> None:
         step(model)
     for value in [v for v in model.graph.inputs if not v.uses()]:
         model.graph.inputs.remove(value)
-    _write_factors_out(model.graph)
-
-
-def _write_factors_out(graph: ir.Graph) -> None:
-    """Give each constant factor beside a matrix product as many elements as what it scales.
-
-    onnxruntime fuses a factor of one element and the product; its FusedMatMul keeps the factor as ``alpha``, a float32
-    attribute, which rounds a law at 1e-8. A value of one element is multiplied with a 1 x 1 matrix instead.
-    """
-    for node in [n for n in graph if n.op_type in ("Mul", "Div")]:
-        scaled, result = node.outputs[0], _shape(node.outputs[0])
-        place = 0 if node.op_type == "Mul" and _number(node.inputs[0]) is not None else 1
-        number, of = _number(node.inputs[place]), node.inputs[1 - place]
-        makers = [] if of is None else [of.producer()]
-        beside = [n.op_type for n in (*makers, *(use.node for use in scaled.uses())) if n is not None]
-        if number is None or "MatMul" not in beside:
-            continue
-        alone = len(result) > 0 and set(result) == {1} and _shape(of) == result
-        values = np.full(result, number)
-        if alone:
-            values = np.full((1, 1), number if node.op_type == "Mul" else 1 / number)
-        factor = ir.Value(name=f"{scaled.name}_factor", const_value=ir.tensor(values, name=f"{scaled.name}_factor"))
-        graph.register_initializer(factor)
-        if alone:
-            product = ir.node("MatMul", [of, factor], num_outputs=1)
-            ir.convenience.replace_nodes_and_values(graph, node, [node], [product], node.outputs, product.outputs)
-        else:
-            node.replace_input_with(place, factor)
-
-
-def _shape(value: ir.Value | None) -> tuple[int, ...]:
-    return tuple(value.shape.numpy()) if value is not None and value.shape is not None else ()
-
-
-def _number(value: ir.Value | None) -> float | None:
-    """The number of a constant of one element."""
-    constant = None if value is None else value.const_value
-    return None if constant is None or constant.size != 1 else float(constant.numpy().reshape(()))
 
 
 def _check(law: ControlLaw, proto: onnx.ModelProto) -> None:

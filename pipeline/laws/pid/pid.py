@@ -212,8 +212,8 @@ class PID(ControlLaw):
         applied = _of(mv_applied, self.mvs)
         p = self.weight * sp - y
         fresh = torch.cat([p, y, torch.zeros_like(p), applied, applied, applied], dim=-1)
-        has_past, kept = torch.split(state, [1, 6 * n], dim=-1)
-        p1, y1, d1, requested1, limited1, applied1 = torch.split(torch.where(has_past > 0, kept, fresh), n, dim=-1)
+        past = torch.where(state[..., :1] > 0, state[..., 1:], fresh)
+        p1, y1, d1, requested1, limited1, applied1 = (past[..., i * n : (i + 1) * n] for i in range(6))
         # An actuator that is not at the limited request was moved by something else: no part is unmet.
         followed = (applied - limited1).abs() <= self.near
         unmet = torch.where(followed, requested1 - limited1, torch.zeros_like(requested1))
