@@ -18,7 +18,8 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.stress.draws import Drawing
 from loopwright.pipeline.evaluation.stress.loops import Outcome, Stress, figures_of, opened
 from loopwright.pipeline.evaluation.stress.summary import Summary
-from loopwright.pipeline.pictures.drawing import number, save
+from loopwright.pipeline.pictures.drawing import save
+from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.stress_pictures import loop_canvas
 from loopwright.pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
 from loopwright.serving.manifest import Manifest

@@ -17,8 +17,9 @@ from typing import Any
 
 from loopwright.pipeline.engine.cluster import connected, unwatched
 from loopwright.pipeline.engine.fingerprint import commit, difference, fingerprint, told
+from loopwright.pipeline.engine.folder import Folder, apply, read_files
 from loopwright.pipeline.engine.output import BARS
-from loopwright.pipeline.engine.stage_files import Folder, StageFiles, apply, read_files
+from loopwright.pipeline.engine.stage_files import StageFiles
 
 FAILED = 2  # exit status of a stage that said why
 

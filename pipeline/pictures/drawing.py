@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +17,10 @@ from matplotlib.path import Path as Outline
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, ScalarFormatter
 
-from loopwright.pipeline.evaluation.case import Curve, Setting
 from loopwright.pipeline.evaluation.evidence import Evidence
-from loopwright.pipeline.evaluation.law_evidence import BASE, Array
+from loopwright.pipeline.evaluation.law_evidence import Array
 from loopwright.pipeline.evaluation.metric import NO_UNIT
 from loopwright.pipeline.files import write_bytes
-from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 from loopwright.serving.manifest import Signal
 
 BASELINE_COLOUR = "#7f7f7f"
@@ -266,76 +263,3 @@ def png(canvas: Canvas) -> bytes:
 def save(canvas: Canvas, path: Path) -> None:
     """Write the PNG whole or not at all."""
     write_bytes(path, png(canvas))
-
-
-def number(value: float, digits: int = 3) -> str:
-    """``value`` with so many digits, thousands grouped and not as a power of ten."""
-    large = 10 ** min(digits, 4) <= abs(value) < 1e9
-    return f"{value:,.0f}" if large else f"{value:.{digits}g}"
-
-
-def ratio(value: float | None) -> str:
-    """A multiple of a bound: two decimals, and more within a hundredth of it; a dash where there is none."""
-    return "–" if value is None else f"{value:.3f}" if abs(value - 1) < 0.01 else f"{value:.2f}"
-
-
-def figure(value: float | None, digits: int = 3) -> str:
-    """A number with so many digits; a dash where nothing was measured."""
-    return "–" if value is None else number(value, digits)
-
-
-def times(value: float | None) -> str:
-    """A ratio with three digits, and one more where it comes near 1."""
-    return "–" if value is None else number(value, 4 if abs(value - 1) < 0.01 else 3)
-
-
-def kilobytes(value: int | None) -> str:
-    """The size of a file."""
-    return "–" if value is None else f"{value / 1024:.0f} kB"
-
-
-WORDS = frozenset({"old", "predictive", "two"})
-"""Words in the names of laws that are no abbreviations."""
-
-
-def law_name(law: str) -> str:
-    """``linearized_pid`` as linearized PID, ``inc`` as INC: a law's abbreviations are upper-case."""
-    parts = law.split("_")
-    return " ".join(p.upper() if (len(p) <= 3 or len(parts) == 1) and p not in WORDS else p for p in parts)
-
-
-def law_label(law: str, words: str) -> str:
-    """A law with its setting in words: INCAD (r=2.5)."""
-    return law_name(law) + (f" ({words})" if words else "")
-
-
-def curve_label(evidence: Evidence, curve: Curve) -> str:
-    """A form of a law, by the variant's name in params.yaml; by its setting, where that is the shipped one or none."""
-    law = evidence.laws.get(curve.law)
-    form = None if law is None else law.form_of(curve.setting)
-    return law_label(curve.law, setting_text(curve.setting) if form in (None, BASE) else str(form))
-
-
-def setting_text(setting: Setting) -> str:
-    """``r=2.5, correction=back_calculation, adaptive``."""
-    return ", ".join(
-        key if value is True else f"{key}={value}" if isinstance(value, str) else f"{key}={value:g}"
-        for key, value in setting.items()
-    )
-
-
-def given_text(settings: Mapping[str, Any]) -> str:
-    """``tuning = search, cv_high = [80, null]``: settings as params.yaml has them, each of them."""
-    return ", ".join(f"{k} = {v if isinstance(v, str) else json.dumps(v)}" for k, v in settings.items())
-
-
-def scenario_name(scenario: str, recipe: bool, own: Mapping[str, str] | None = None) -> str:
-    """A test inside a sentence: held-out set points, set point with noise; ``own`` is ``Case.test_words``."""
-    bare = scenario.removesuffix(NOISE_SUFFIX)
-    if own and bare in own:
-        words = own[bare]
-    elif bare == "held_out":
-        words = "held-out recipes" if recipe else "held-out set points"
-    else:
-        words = bare.replace("_", " ")
-    return words + (" with noise" if scenario != bare else "")

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure as Canvas
 
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.verdicts import Check, Outcome
-from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, Draw, clear_legend, number, scale
+from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, Draw, clear_legend, scale
+from loopwright.pipeline.pictures.numbers import number
 
 TRAINED = {"one_step_trained": ("one step", "s"), "free_run_trained": ("free runs", "o")}
 """Metrics of a part: the objective of the network's last training, and its mark."""

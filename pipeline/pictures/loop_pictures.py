@@ -24,19 +24,16 @@ from loopwright.pipeline.pictures.drawing import (
     SIZE,
     axis_label,
     colour_of,
-    curve_label,
     fit_labels,
-    law_name,
     layer,
     legend_below,
-    number,
-    ratio,
     ratio_unit,
     scale,
-    scenario_name,
     signal_label,
     time_axis,
 )
+from loopwright.pipeline.pictures.numbers import number, ratio
+from loopwright.pipeline.pictures.words import curve_label, law_name, scenario_name
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 from loopwright.serving.manifest import Signal
 

@@ -22,13 +22,13 @@ from loopwright.pipeline.pictures.drawing import (
     axis_label,
     colour_of,
     fit_labels,
-    law_name,
     legend_below,
-    number,
     scale,
     signal_label,
     time_axis,
 )
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 
 if TYPE_CHECKING:
     from loopwright.pipeline.models.static.sweep import SweepResult

@@ -11,7 +11,7 @@ import numpy as np
 
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.validation import Validation
-from loopwright.pipeline.pictures.drawing import law_name
+from loopwright.pipeline.pictures.words import law_name
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.simulation.scenario import Scenario

@@ -14,7 +14,7 @@ from loopwright.pipeline.errors import ReportError
 from loopwright.pipeline.evaluation.case import Figure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.model_evidence import candidates, identified_part
-from loopwright.pipeline.pictures.drawing import STYLE, CasePicture, Draw, save, scenario_name
+from loopwright.pipeline.pictures.drawing import STYLE, CasePicture, Draw, save
 from loopwright.pipeline.pictures.identified_pictures import free_run_picture, gains_picture, step_responses_picture
 from loopwright.pipeline.pictures.loop_pictures import (
     cycle_picture,
@@ -29,6 +29,7 @@ from loopwright.pipeline.pictures.model_pictures import (
     predictions_picture,
     replay_picture,
 )
+from loopwright.pipeline.pictures.words import scenario_name
 from loopwright.pipeline.report.own_acceptance import shipped_laws, worst_test
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 

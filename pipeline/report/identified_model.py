@@ -13,7 +13,8 @@ from loopwright.pipeline.evaluation.model_evidence import identified_part
 from loopwright.pipeline.files import read_json
 from loopwright.pipeline.historian.cleaning.outliers_and_units import usual
 from loopwright.pipeline.historian.drift import Levels, levels_of
-from loopwright.pipeline.pictures.drawing import axis_label, figure, gain_unit, number
+from loopwright.pipeline.pictures.drawing import axis_label, gain_unit
+from loopwright.pipeline.pictures.numbers import figure, number
 
 SCREENING = "screening.json"  # beside the record
 GONE = "the model explains the rest, no drift is left, and there is nothing to do"

@@ -7,7 +7,8 @@ from typing import Any
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import BASE
 from loopwright.pipeline.evaluation.metric import NO_UNIT
-from loopwright.pipeline.pictures.drawing import axis_label, given_text
+from loopwright.pipeline.pictures.drawing import axis_label
+from loopwright.pipeline.pictures.words import given_text
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from loopwright.pipeline.evaluation.leaderboard import LawStanding, Standing, tally
-from loopwright.pipeline.pictures.drawing import ratio
+from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.report.templating import REGISTRY_URL, render, write_pages
 
 Count = tuple[int, int]

@@ -15,7 +15,9 @@ from loopwright.pipeline.evaluation.proof import known_rows, statements
 from loopwright.pipeline.evaluation.validation import Statement
 from loopwright.pipeline.historian.settling import in_words
 from loopwright.pipeline.historian.step_test import ALONE, HOLDS, LARGEST, MOVES
-from loopwright.pipeline.pictures.drawing import axis_label, law_name, number, scenario_name, times
+from loopwright.pipeline.pictures.drawing import axis_label
+from loopwright.pipeline.pictures.numbers import number, times
+from loopwright.pipeline.pictures.words import law_name, scenario_name
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 

@@ -14,7 +14,9 @@ from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED, candidates
 from loopwright.pipeline.evaluation.validation import FILE, reference_words
 from loopwright.pipeline.evaluation.verdicts import Claims
 from loopwright.pipeline.optimal.bounds import bounded
-from loopwright.pipeline.pictures.drawing import CasePicture, law_name, number, ratio, scenario_name
+from loopwright.pipeline.pictures.drawing import CasePicture
+from loopwright.pipeline.pictures.numbers import number, ratio
+from loopwright.pipeline.pictures.words import law_name, scenario_name
 from loopwright.pipeline.report.figures import draw_all, main_words
 from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from loopwright.pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows

@@ -16,7 +16,7 @@ from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.evaluation.leaderboard import LawStanding, Standing, by_reason, tally, withheld_in
 from loopwright.pipeline.evaluation.metric import with_unit
 from loopwright.pipeline.evaluation.validation import FILE, Validation
-from loopwright.pipeline.pictures.drawing import ratio
+from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.simulation import NOISE_SUFFIX
 
 WIDTH = 120  # letters of the table, where no terminal says how wide it is

@@ -12,7 +12,8 @@ from loopwright.pipeline.evaluation.stress.draws import KINDS, MOST_SPAN, MOST_Z
 from loopwright.pipeline.evaluation.stress.loops import Outcome, Stress
 from loopwright.pipeline.evaluation.stress.summary import QUANTILES, Summary, table
 from loopwright.pipeline.files import draft_of
-from loopwright.pipeline.pictures.drawing import number, save
+from loopwright.pipeline.pictures.drawing import save
+from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.stress_pictures import growth_canvas, loop_canvas, spread_canvas
 from loopwright.pipeline.report.templating import render, write_pages
 from loopwright.serving.manifest import Signal

@@ -10,7 +10,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from loopwright.pipeline.files import write_text
-from loopwright.pipeline.pictures.drawing import figure, kilobytes, ratio, times
+from loopwright.pipeline.pictures.numbers import figure, kilobytes, ratio, times
 from loopwright.serving.words import harmless
 
 REGISTRY_URL = "http://127.0.0.1:5000/#/models"

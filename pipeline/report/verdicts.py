@@ -19,7 +19,8 @@ from loopwright.pipeline.evaluation.validation import (
 )
 from loopwright.pipeline.evaluation.verdicts import ABSOLUTE, RELATIVE, Claims, Reason, close, plain_reason
 from loopwright.pipeline.files import digest
-from loopwright.pipeline.pictures.drawing import curve_label, law_name, number
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import curve_label, law_name
 from loopwright.pipeline.report.own_acceptance import own_acceptance
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 

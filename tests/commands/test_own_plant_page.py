@@ -55,7 +55,7 @@ def test_the_commands_print_what_the_page_shows(
 
 
 def test_each_doubt_that_the_page_explains_is_one_that_new_can_print() -> None:
-    files = ("historian/excitation.py", "historian/notices.py", "historian/cleaning/tag_checks.py", "records/levels.py")
+    files = ("historian/excitation.py", "historian/notices.py", "historian/cleaning/tag_checks.py", "records/record.py")
     source = "".join((ROOT / "pipeline" / file).read_text(encoding="utf-8") for file in files)
     table = PAGE[PAGE.index("| it says |") : PAGE.index("`--replace` puts")]
     rows = [row.split("|")[1] for row in table.splitlines()[2:] if row.startswith("|")]

@@ -33,7 +33,7 @@ FILES = (
     "start.py",
     "with_cluster.py",
     "parent_death.py",
-    "stderr_filter.py",
+    "output.py",
     "cluster.py",
     "stage_files.py",
 )

@@ -5,20 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.pipeline.pictures.drawing import (
-    BASELINE_COLOUR,
-    PALETTE,
-    colour_of,
-    law_label,
-    law_name,
-    number,
-    ratio,
-    ratio_unit,
-    scenario_name,
-    setting_text,
-    time_axis,
-)
+from loopwright.pipeline.pictures.drawing import BASELINE_COLOUR, PALETTE, colour_of, ratio_unit, time_axis
 from loopwright.pipeline.pictures.loop_pictures import finite, moves, over_orders
+from loopwright.pipeline.pictures.numbers import number, ratio
+from loopwright.pipeline.pictures.words import law_label, law_name, scenario_name, setting_text
 
 
 def test_a_settings_words_say_what_it_is():

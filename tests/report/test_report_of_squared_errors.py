@@ -23,9 +23,9 @@ from loopwright.pipeline.evaluation.metric import METRICS
 from loopwright.pipeline.evaluation.model_evidence import candidates, model_figure
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.evaluation.verdicts import plain_reason
-from loopwright.pipeline.pictures.drawing import ratio
 from loopwright.pipeline.pictures.loop_picture import History, summary
 from loopwright.pipeline.pictures.loop_pictures import info_picture
+from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.report.page import headline
 from loopwright.pipeline.report.results import show_results
 from loopwright.pipeline.report.verdicts import gate_id, judge, requirement, table_row

@@ -12,7 +12,8 @@ from loopwright.pipeline.evaluation.case import Curve, PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
 from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from loopwright.pipeline.pictures.drawing import law_name, number
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 
 TEST, NOISY = "trajectory", "trajectory_noise"
 

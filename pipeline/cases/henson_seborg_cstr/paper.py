@@ -13,7 +13,7 @@ from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
 from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from loopwright.pipeline.pictures.drawing import number
+from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.steady import Linearization
 

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure as Canvas
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Array
 from loopwright.pipeline.evaluation.verdicts import Outcome
-from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, legend_below, number
+from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, legend_below
+from loopwright.pipeline.pictures.numbers import number
 
 SET = "hybrid_fuzzy"
 MODES = {"hot": "#d55e00", "cold": "#0072b2"}

@@ -32,7 +32,8 @@ from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
 from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from loopwright.pipeline.pictures.drawing import law_name, number
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 
 IDEAL = 1e-12  # [deg C] of rounding
 OFFSET = 0.05  # [deg C]

@@ -17,12 +17,12 @@ from loopwright.pipeline.pictures.drawing import (
     CasePicture,
     Draw,
     colour_of,
-    law_name,
     legend_below,
-    number,
     scale,
     time_axis,
 )
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 
 SMALLEST = 1e-4  # [deg C] that a bar of offsets shows
 ROOM = 1.6  # factor above the highest point of a logarithmic axis, for its number

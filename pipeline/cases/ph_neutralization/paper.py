@@ -12,8 +12,9 @@ from loopwright.pipeline.evaluation.case import Curve, PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
 from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from loopwright.pipeline.pictures.drawing import curve_label, number, ratio
 from loopwright.pipeline.pictures.loop_pictures import LONGEST
+from loopwright.pipeline.pictures.numbers import number, ratio
+from loopwright.pipeline.pictures.words import curve_label
 
 SET, DISTURBED = "set_point", "disturbance"
 PENALTY_1, PENALTY_LOW = (Curve("linearized_pid", {"penalty": value}) for value in (1.0, 0.4))

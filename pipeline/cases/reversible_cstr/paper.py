@@ -17,8 +17,8 @@ from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Array
 from loopwright.pipeline.evaluation.timing import step_within
 from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
-from loopwright.pipeline.pictures.drawing import number
 from loopwright.pipeline.pictures.free_runs import free_run_fit_at_least, one_step_says_little
+from loopwright.pipeline.pictures.numbers import number
 
 SET = "plant_network"
 ALMOST = 0.95  # of the feed: what "almost complete" asks for

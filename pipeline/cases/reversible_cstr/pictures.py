@@ -22,16 +22,16 @@ from loopwright.pipeline.pictures.drawing import (
     axis_label,
     clear_legend,
     colour_of,
-    law_name,
     layer,
     legend_below,
-    number,
     scale,
     signal_label,
     symbol,
     time_axis,
 )
 from loopwright.pipeline.pictures.free_runs import free_run_picture
+from loopwright.pipeline.pictures.numbers import number
+from loopwright.pipeline.pictures.words import law_name
 from loopwright.pipeline.tuning.reference_model import CLASSIC, ORDERS, ReferenceModel
 
 SPAN, STEP = 13.0, 0.02  # of the time wn t that is drawn

@@ -20,7 +20,7 @@ from loopwright.pipeline.evaluation.case import (
     Requirement,
     Setting,
 )
-from loopwright.pipeline.pictures.drawing import law_label, setting_text
+from loopwright.pipeline.pictures.words import law_label, setting_text
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.simulation.scenario import Scenario, held, random_levels
 

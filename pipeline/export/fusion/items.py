@@ -14,7 +14,7 @@ from loopwright.pipeline.export.fusion.plan import Choice, Given, Input, Item, M
 from loopwright.pipeline.export.fusion.pools import Group, Selection  # fmt: skip
 from loopwright.pipeline.export.fusion.reading import Reading
 
-INT64 = 7
+INT64 = 7  # ONNX's number of the type
 
 
 class Items:
