@@ -21,7 +21,7 @@ from loopwright.pipeline.engine.folder import Folder, apply, read_files
 from loopwright.pipeline.engine.output import BARS
 from loopwright.pipeline.engine.stage_files import StageFiles
 
-FAILED = 2  # exit status of a stage that said why
+FAILED = 2  # exit status of a stage that was lost or that its worker refused; stderr says why
 
 
 def run_on(at: str, arguments: Sequence[str], files: StageFiles) -> int:

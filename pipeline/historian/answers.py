@@ -26,7 +26,7 @@ from loopwright.pipeline.records.record import Record
 FINE = 6  # lags with a coefficient of their own; later ones share one
 WIDER = 1.5  # a block over the one before
 MOST_LAGS, SHORTEST = 160, 10  # lags
-ROWS_A_COEFFICIENT = 6  # rows that a coefficient of the response needs
+ROWS_A_COEFFICIENT = 6  # rows for each coefficient of the model: of the PV, the inputs and a constant
 SCORES = 40  # parts of the rows whose sums say how far the coefficients may be off
 FLAT = 1e-12  # eigenvalue of the regressors' covariance, over the largest, below which a direction never moved
 DRAWS = 200  # sets of coefficients of which a spread is taken
@@ -132,7 +132,7 @@ PART, CHANCE = 0.25, 9.0  # of the largest change: an answer that begins so is e
 AGAIN = 3.0  # standard deviations that are not taken for chance there
 COLOUR = 12  # rows that noise remembers
 MOST_ROWS = 400_000  # rows that are looked at
-RIDGE = 1e-6  # of the first autocovariance: keeps the equations solvable
+RIDGE = 1e-6  # share of the autocovariance at lag 0, on the diagonal: keeps the equations solvable
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from loopwright.pipeline.metrics import Array
 Runs = NDArray[np.int64]
 
 OWN, SEEN_ROWS = 3, 3  # rows of an MV's own past, and of a PV's, that explain its moves
-MOST_ROWS = 60_000  # rows of the test: more cost time and decide nothing
+MOST_ROWS = 60_000  # rows: from twice as many on every second is taken; more cost time and decide nothing
 SURE = 10.0  # F of a share, below which it is chance
 LATER = (5, 30)  # rows after a move over which the plant's answer is told from the controller's
 CERTAIN = 2.0  # standard deviations of that answer

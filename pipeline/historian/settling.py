@@ -29,7 +29,7 @@ RESPONSES_AGREE = 1.6  # ratio of two settling times that are the same, blocks o
 WITHIN = 0.1  # of the end, as `Linear.settling`
 ROWS_A_LAG = 4  # rows of the fit for each of its coefficients, at least
 RAMP, GROWS = 60, 1.3  # rows over which a ramp is followed, and its end over the middle
-MOST_ROWS = 24_000  # rows of a fit: more cost time and hardly change it
+MOST_ROWS = 24_000  # rows of a fit, the first ones: more cost time and hardly change it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

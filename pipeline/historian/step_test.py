@@ -25,7 +25,7 @@ GUESSED_H, LONGEST_H = 12.0, 24.0  # [h] of a test, its hold guessed, and any
 FEWEST = 8  # random moves
 ALONE = 1.5  # settling times that one MV alone is held for
 HOLDS = (0.4, 0.7, 1.0, 1.6)  # of the settling time
-LEAST_PERIODS = 5  # rows of the shortest hold
+LEAST_PERIODS = 5  # rows of the shortest hold; fewer where the test would last longer than LONGEST_H
 SEED = 0  # of the moves
 
 

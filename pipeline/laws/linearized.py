@@ -87,7 +87,7 @@ class NnarxPid(AdaptivePid):
         return (y - ahead.y - ahead.slope * move).abs()
 
 
-DOUBLINGS = 12  # lengths of a step that are tried, each twice the one before
+DOUBLINGS = 12  # most doublings of the penalty within a sample: candidates of 1 to 2^12 times
 
 
 class LinearizedPid(NnarxPid):

@@ -23,7 +23,7 @@ from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.pictures.drawing import SIZE, STYLE
 
 POWER, COHERENCE, BAND, LIMIT = "#0072b2", "#d55e00", "#cccccc", "#882255"
-MOST_INPUTS = 6  # inputs that have a picture
+MOST_INPUTS = 6  # inputs that have a picture, and pairs of inputs whose correlation is drawn
 ROW = 2.1  # inches
 BINS = 20  # of a histogram of moves
 

@@ -79,7 +79,7 @@ LINE = "#0072b2"
 POINTS = 3000  # of a line; more are drawn by their extremes
 PANEL, HEAD = 1.35, 1.0  # inches
 MOST_PANELS, MOST_DETAILS = 8, 6
-MOST_SPANS = 400  # spans that are drawn: more would be a grey area
+MOST_SPANS = 400  # spans of one reason that are drawn, and pieces of a line before it is thinned
 AROUND, AROUND_SHARE = 25, 0.6  # rows beside a detail, or this share of its length
 
 

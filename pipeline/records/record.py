@@ -221,7 +221,7 @@ def check_mv(table: Table, signal: Signal, mv: Array) -> None:
         )
 
 
-MOST = 3  # levels at which an input that has few of them is most often
+MOST = 3  # levels at most of an input that counts as one of few levels
 NEAR = 1e-3  # of the span: values of one level
 ROWS = 0.99  # of the rows at the levels; a mean over a period in which the input was moved lies between two
 

@@ -26,7 +26,7 @@ from loopwright.pipeline.report.verdicts import BOUNDS, RULE, Judged, judge, val
 from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span
 from loopwright.pipeline.tuning.rules import PidSettings
 
-MOST_HEADLINES = 5  # rows at the head of a report
+MOST_HEADLINES = 5  # headline rows; those of each CV and of the models' fits come on top
 
 
 def write_report(evidence: Evidence, claims: Claims, own: Sequence[CasePicture], out: Path) -> list[Path]:

@@ -20,11 +20,19 @@ Cost = Callable[[Sequence[Loops]], Array]
 """Costs of candidates, infinite where a loop breaks, all at once."""
 
 SPEEDS = tuple(np.geomspace(0.5, 32.0, 10))  # closed-loop time constants, in dead times and periods
-WEIGHTS = (1.0, 0.7, 0.4)  # set-point weights that are tried
+WEIGHTS = (1.0, 0.7, 0.4)  # set-point weights that are tried first, common to all loops
 GAINS, INTEGRALS = (0.5, 0.7, 1.0, 1.4, 2.0), (0.4, 0.63, 1.0, 1.6, 2.5)
 DERIVATIVES, FILTERS = (0.0, 0.07, 0.15, 0.3), (0.125, 0.5)  # Td of Ti, Tf of Td
-NEAR = (0.8, 0.9, 1.0, 1.11, 1.25)  # factors of gains and integral times about the best ones
-FINE_WEIGHTS = (0.2, 0.3, 0.5, 0.6, 0.8, 0.9, 1.0)  # set-point weights that are tried at last
+NEAR = (0.8, 0.9, 1.0, 1.11, 1.25)  # factors of gains and integral times about the best ones, in the second round
+FINE_WEIGHTS = (
+    0.2,
+    0.3,
+    0.5,
+    0.6,
+    0.8,
+    0.9,
+    1.0,
+)  # set-point weights tried for each loop by itself, last in a round
 
 
 def simc(process: FirstOrder, period_s: float, tau_c_s: float) -> PidSettings:

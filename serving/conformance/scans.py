@@ -18,7 +18,7 @@ from loopwright.serving.manifest import Manifest, Signal
 Array: TypeAlias = NDArray[np.float64]
 
 RECOVER_AFTER = 3  # good samples in a row after which a loop goes on
-MAX_GAP = 3  # periods without a good sample that a loop bridges
+MAX_GAP = 3  # missed periods in a row that a law bridges: after more it starts cold
 STANDS = 0.3  # share of its range at which an actuator stands before the loop's first command: not its middle
 SURE = 0.4  # share of a margin by which a value lies inside or outside it
 

@@ -17,7 +17,7 @@ from loopwright.serving.manifest import SENSITIVE, Manifest, Signal
 Array: TypeAlias = NDArray[np.float64]
 
 COURSE = 0.03  # share of a range that an input moves at most from step to step while it follows a course
-COLD_STARTS = 10  # steps without a past that a host repeats
+COLD_STARTS = 10  # cold starts that a host repeats, each with two steps after it
 DRAWS = 40  # tried for a step whose MV lies inside its range
 AT_AN_END = 0.1  # share of the values drawn anywhere that lie at an end of the range
 

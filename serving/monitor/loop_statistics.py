@@ -162,7 +162,7 @@ class Foresight(Remembers):
 
 CROSSINGS = 20  # intervals between crossings that regularity needs: ten of noise and loads are regular by chance
 ORDER = 15  # of the error's autoregressive model
-LEAST = 1e-12  # smallest variance that is divided by
+LEAST = 1e-12  # variance of the error up to which the index is 1: a larger one is divided by
 
 
 class Swing(Remembers):

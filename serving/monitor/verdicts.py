@@ -72,7 +72,7 @@ def unit_of(s: Signal) -> str:
 # ------------------------------------------------------------------------------------------ the meaning of the figures
 MOST_HOLD = 0.02
 LEAST_SHARE, LEAST_OUTSIDE = 0.2, 0.1
-SWINGS = 1.0  # of what a swing needs to be one: above it, it is told
+SWINGS = 1.0  # regularity of the error's crossings above which it is a swing, if large enough too
 WORSE = 2.0  # times the validation's worst mean error: how often set points move is another matter here
 LOUD = 4.0  # times the error at rest: noise crosses zero regularly too, by chance
 PLAIN = 0.1  # of a set point's range: a swing that needs no measure of what is normal

@@ -8,7 +8,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 REQUEST_S = 10.0  # in which a request's head must be here
 STALLED_S = 30.0  # in which an answer that is waiting must be taken
-MOST_CONNECTIONS = 200  # browsers at once
+MOST_CONNECTIONS = 200  # connections at once, not browsers: beyond it the longest idle one is closed
 
 
 class Impatient(H11Protocol):

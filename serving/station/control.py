@@ -21,7 +21,7 @@ from loopwright.serving.words import first_line, named, plain
 Answer: TypeAlias = dict[str, Any]
 
 LONGEST = 100_000  # bytes of a request
-PATIENCE_S = 10.0  # [s] that a request waits for its loop
+PATIENCE_S = 10.0  # [s] to wait for the loop's answer (a swap's longer), and for a request's line
 
 
 class Control:

@@ -14,7 +14,7 @@ from loopwright.pipeline.evaluation.stress.draws import Draw
 from loopwright.pipeline.evaluation.stress.loops import Outcome, figures_of
 from loopwright.pipeline.plants.simulator import Array
 
-QUANTILES = (0.05, 0.5, 0.9, 0.99, 1.0)  # of a figure over all loops, the worst one last
+QUANTILES = (0.05, 0.5, 0.9, 0.99, 1.0)  # of a figure over the loops of one test or of all, the largest value last
 WORST = 10  # loops that are listed, the worst first
 BINS = 5  # equal shares of the loops along a drawn quantity
 LEAST_LOOPS = 4  # in a share whose median is shown

@@ -27,7 +27,7 @@ LOADS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 ERRORS = (0.03, 1.0)
 """Variances of the states' errors, over that of the measurement."""
 
-BURN_IN = 0.1  # of a stretch: rows in which the filter forgets its start
+BURN_IN = 0.1  # share of a stretch in which the filter forgets its start, within LEAST to MOST rows
 LEAST, MOST = 20, 300
 """Rows at the beginning of a stretch that do not count while the filter forgets its start: a share, and its ends."""
 

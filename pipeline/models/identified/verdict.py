@@ -38,7 +38,7 @@ LATE, BENT = 30, 1.2
 SURE = 2.0
 """Standard deviations from zero beyond which a gain's sign is certain."""
 
-POINTS = 60  # samples of a course that are compared
+POINTS = 60  # points kept of a step response, which is computed over twice as many samples or more
 LONGEST = 960
 """Points of a step response, and the most periods that it spans."""
 
