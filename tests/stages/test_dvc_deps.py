@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import shutil
+import tokenize
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,7 @@ from loopwright.pipeline.stages.code import (
     listing,
     modules,
     path_of,
+    without_comments,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -138,3 +141,14 @@ def test_a_folder_of_compiled_files_hides_no_module(tmp_path: Path) -> None:
     assert path_of(tmp_path, "loopwright.pipeline.models.tank") == tmp_path / "pipeline/models/tank.py"
     (tmp_path / "pipeline/models/tank/__init__.py").touch()
     assert path_of(tmp_path, "loopwright.pipeline.models.tank") == tmp_path / "pipeline/models/tank/__init__.py"
+
+
+def test_comments_are_those_of_the_tokenizer() -> None:
+    """A ``#`` in a text is none, whatever its quotes."""
+    for file in sorted((ROOT / "pipeline").rglob("*.py")):
+        source = file.read_text(encoding="utf-8")
+        lines: list[str | None] = [*source.split("\n")]
+        for token in tokenize.generate_tokens(io.StringIO(source).readline):
+            if token.type == tokenize.COMMENT:
+                lines[token.start[0] - 1] = token.line[: token.start[1]].rstrip() or None
+        assert without_comments(source) == "\n".join(line for line in lines if line is not None), file
