@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models.identified.identified import Identified, assembled, noise_of
 from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx, with_units

@@ -31,7 +31,7 @@ from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.proof import fit_doubts, sign_doubts, wants_a_plainer_model
 from loopwright.pipeline.evaluation.trials import close_loop
 from loopwright.pipeline.excitation.planned import excited, first_test, planned
-from loopwright.pipeline.export.controller_file import export as write_controller
+from loopwright.pipeline.export.gate import export as write_controller
 from loopwright.pipeline.historian.cleaning.tags import Tag, check_tags, named, parse_tag, read_tags
 from loopwright.pipeline.historian.export_params import exported, screened_export, with_units
 from loopwright.pipeline.historian.files.file_reader import tags_in

@@ -22,7 +22,7 @@ from shipped import required
 from threadpoolctl import threadpool_limits
 
 from loopwright.pipeline.cases import PLANTS
-from loopwright.pipeline.export import controller_file
+from loopwright.pipeline.export import gate
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.models import Model
 from loopwright.pipeline.models.lagged.lagged import ARX, NNARX
@@ -53,7 +53,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Steps of an export's parity gate: a law that differs from its graph differs within some of them, and most tests export
 # for another reason. test_export.py takes all of them.
-STEPS_OF_GATE, controller_file.GATE_STEPS = controller_file.GATE_STEPS, 60
+STEPS_OF_GATE, gate.GATE_STEPS = gate.GATE_STEPS, 60
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
 QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}

@@ -12,7 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from loopwright.pipeline.export.controller_file import assembled, export, with_evidence
+from loopwright.pipeline.export.controller_file import assembled, with_evidence
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import ControlLaw
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving import Controller, Signal

@@ -23,7 +23,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.law_evidence import BASE
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
 from loopwright.pipeline.evaluation.proof import question, sign_doubts
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.files import digest, read_json, write_json
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.laws.suitability import require_fit

@@ -26,8 +26,8 @@ from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
 from loopwright.serving.graph.audit import MAX_BYTES, audit
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
+from loopwright.serving.page.access import LONGEST_BODY, Access
 from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, Shared, shown
-from loopwright.serving.page.settings import LONGEST_BODY, Access
 from loopwright.serving.page.trend import MOST_POINTS, trend
 from loopwright.serving.words import plain
 

@@ -19,7 +19,7 @@ from loopwright.pipeline import commands
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.metrics import mae
 from loopwright.pipeline.plants.equations import EquationPlant

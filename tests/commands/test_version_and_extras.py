@@ -92,3 +92,18 @@ def test_check_says_once_that_a_wheel_holds_no_bounds(monkeypatch: pytest.Monkey
     assert said == [check.FROM_A_WHEEL]
     monkeypatch.setattr(check, "bounds_path", lambda case: ROOT / "pipeline/cases" / case.name / "none.json")
     assert any("run `loopwright bounds" in line for line in check.notes())
+
+
+@pytest.mark.parametrize(
+    ("module", "heavy"),
+    [
+        ("loopwright.serving.station.command", {"starlette", "torch"}),  # the page is a process of its own
+        ("loopwright.pipeline.stages.validate", {"torch"}),
+        ("loopwright.pipeline.engine.start", {"numpy", "torch"}),
+    ],
+)
+def test_who_starts_often_loads_nothing_heavy(module: str, heavy: set[str]) -> None:
+    """Nor what an extra brings that the command can do without."""
+    code = f"import sys, {module}; print(sorted({heavy} & set(sys.modules)))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert found.stdout.strip() == "[]"

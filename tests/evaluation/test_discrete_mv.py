@@ -12,7 +12,7 @@ from shipped import required
 
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import PLANTS
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
 from loopwright.serving import (
     Controller,

@@ -20,7 +20,7 @@ from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.evaluation.stress.draws import KINDS, LATE, NOISE, Actuators, Draw, Drawing
 from loopwright.pipeline.evaluation.stress.loops import Stress, advance_rows, swings
 from loopwright.pipeline.evaluation.stress.summary import Summary, table
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator

@@ -17,8 +17,9 @@ from quick_laws import STEPS_OF_GATE
 from torch import Tensor
 
 from loopwright.pipeline.errors import ExportError
-from loopwright.pipeline.export import controller_file
-from loopwright.pipeline.export.controller_file import GATE_TOLERANCE, export, parity_gate, with_evidence
+from loopwright.pipeline.export import gate
+from loopwright.pipeline.export.controller_file import with_evidence
+from loopwright.pipeline.export.gate import GATE_TOLERANCE, export, parity_gate
 from loopwright.pipeline.export.graph import law_graph
 from loopwright.pipeline.laws import ControlLaw
 from loopwright.pipeline.plants.simulator import Signals
@@ -33,7 +34,7 @@ ONE = Signal("x", "-", -1e6, 1e6)
 
 @pytest.fixture(autouse=True)
 def whole_gate(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(controller_file, "GATE_STEPS", STEPS_OF_GATE)
+    monkeypatch.setattr(gate, "GATE_STEPS", STEPS_OF_GATE)
 
 
 def loop_signals(**changed: Any) -> Signals:

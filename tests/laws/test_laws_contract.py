@@ -16,7 +16,7 @@ from torch import Tensor
 
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.laws.reference.reference_law import ReferenceLaw
 from loopwright.pipeline.plants.equations import EquationPlant

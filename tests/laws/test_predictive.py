@@ -16,7 +16,7 @@ from predictive_loops import NONE, closed, law_of, row
 from torch import Tensor
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws.predictive.disturbance_model import Where, loads_of
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
 from loopwright.pipeline.laws.predictive.horizon_check import horizon_for, settling_times, step_responses

@@ -19,7 +19,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.law_evidence import BASE
 from loopwright.pipeline.evaluation.trials import try_files
 from loopwright.pipeline.excitation import EXCITATIONS
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.metrics import mv_travel
 from loopwright.pipeline.models.lagged.lagged import ArxPart

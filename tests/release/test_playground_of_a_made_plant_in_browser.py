@@ -15,7 +15,7 @@ from chromium import CHROMIUM, launched
 from torch import Tensor
 
 from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.export.plant_graphs import plant_graphs
 from loopwright.pipeline.laws import ControlLaw
 from loopwright.pipeline.plants.equations import EquationPlant

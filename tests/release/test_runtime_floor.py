@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import shipped_files
 
-from loopwright.pipeline.export.controller_file import GATE_TOLERANCE
+from loopwright.pipeline.export.gate import GATE_TOLERANCE
 from loopwright.serving import Controller
 
 ROOT = Path(__file__).parents[2]

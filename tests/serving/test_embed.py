@@ -14,7 +14,7 @@ import pytest
 from kits import DAMAGES, OLD, kit_of, spoilt, verdict_on
 from shipped_files import SHIPPED
 
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import ControlLaw
 from loopwright.serving import Controller
 

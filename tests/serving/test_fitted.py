@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving import (
     ContractError,

@@ -24,7 +24,7 @@ from plant_servers import UNKNOWN, Plant, RunningLoop, spoil
 from processes import within
 
 from loopwright.pipeline.__main__ import main
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving import Controller, LoopError, Mode
 from loopwright.serving.journal import JournalReader

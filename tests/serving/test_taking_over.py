@@ -12,7 +12,7 @@ import pytest
 from shipped_files import SHIPPED
 
 from loopwright.pipeline.cases import CASES
-from loopwright.pipeline.export.controller_file import export
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
 from loopwright.serving import (
     Controller,
@@ -306,7 +306,7 @@ def fast(law: Any, sp: Any, pv: Any, dv: Any, mv_applied: Any, state: Any) -> An
 
 @pytest.fixture(scope="session")
 def fast_file(make_formula: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from loopwright.pipeline.export.controller_file import export
+    from loopwright.pipeline.export.gate import export
 
     path = tmp_path_factory.mktemp("controller") / "fast.onnx"
     export(make_formula(fast), path, case="tank", provenance={})
