@@ -1,4 +1,4 @@
-"""The modes of a loop, how a fault changes them, the action where a fault lasts, and the result of a scan."""
+"""The modes of a loop, how a fault changes them, the result of a scan, and the way of an MV to a law or an operator."""
 
 from __future__ import annotations
 

@@ -24,6 +24,7 @@ from loopwright.pipeline.pictures.stress_pictures import loop_canvas
 from loopwright.pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
 from loopwright.serving.manifest import Manifest
 
+# Loops, their seed, spread and faults [%], and loops of a piece of work.
 PLANTS, SEED, SPREAD, FAULTS, BATCH = 1000, 0, 2.0, 50.0, 100
 FEW = 500  # loops that are done before workers have started
 PIECES = 4  # a worker at least, so that none waits long for the last

@@ -1,4 +1,4 @@
-"""Times to leave out of a record, as params.yaml and the command line write them: ``FROM..TO``."""
+"""``exports.<plant>`` of params.yaml: the files that a record is made of, and the times to leave out of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Output of stages and workers on the terminal."""
+"""Output of stages and workers on the terminal.
+
+A worker's process holds several stages at a time, of which one at most runs; the others wait for their pieces. So what
+is said belongs to the thread that says it.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from loopwright.pipeline.engine.output import BARS, MARK
 
-EVERY_S, MARKED_EVERY_S = 10.0, 0.5
+EVERY_S, MARKED_EVERY_S = 10.0, 0.5  # [s] between two lines, for a person and for a program that draws the bar
 KNOWN = 0.2  # share of a piece after which its speed says how long the rest takes
 SOON_S = 5.0  # time left that is not worth a word
 

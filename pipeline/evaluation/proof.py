@@ -1,4 +1,4 @@
-"""Whether the record of an own plant proves the model that all tests ran on: the requirements of the model itself."""
+"""Whether the record of an own plant proves its model, beside what an engineer knows of the plant."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def _settling(theta: Array, motion: Array, blocks: Blocks) -> int:
 
 # -------------------------------------------------------------------------------------------------- what is left of it
 BLOCK = 20  # rows at least that one level is the mean of; more where the plant is slow
-LEVELS, MOST_LEVELS = 12, 2_000
+LEVELS, MOST_LEVELS = 12, 2_000  # blocks of which levels are taken: the fewest, and about the most
 WANDERS = 0.015  # of the PV's span: standard deviation of the levels
 OF_NOISE = 3.0  # of what noise alone leaves in a mean
 EXPLAINED = 0.7  # of the levels' variance, by a ramp or a jump

@@ -104,12 +104,12 @@ def _of_input(frequency: Array, cross: NDArray[np.complex128], i: int, settling:
 Runs = NDArray[np.int64]
 
 MOVE_SHARE = 0.02  # of an input's own span: a move that counts
-FEW_MOVES, ENOUGH_MOVES = 6, 20
+FEW_MOVES, ENOUGH_MOVES = 6, 20  # of an input: fewer are a question, and as many are wanted
 SEEN = 4.0  # strength of an answer
 FOLLOWS, FOLLOWS_CLOSELY = 0.15, 0.9  # share of the moves that the PVs' past explains
 ALIKE, THE_SAME = 0.9, 0.98  # correlation of two inputs
 NARROW = 0.05  # of an MV's range
-ROWS_A_PARAMETER, LEAST_ROWS_A_PARAMETER = 20, 4
+ROWS_A_PARAMETER, LEAST_ROWS_A_PARAMETER = 20, 4  # rows that are wanted, and below which there are too few
 IN_BAND = 0.1  # share of an input's power in the plant's band
 COHERENT = 0.3  # coherence in the band
 LONG_DELAY, LEAST_DELAY = 1.0, 20  # dead time over what follows it, and rows

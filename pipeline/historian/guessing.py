@@ -66,7 +66,7 @@ LABEL = re.compile(
 )
 HELD_SHARE = 0.9  # of the readings equal to the one before: moved in steps
 LEAST_GOOD = 0.5  # share of the readings of a tag that is tried as a disturbance
-MOST_TRIED, MOST_READINGS = 60, 20_000
+MOST_TRIED, MOST_READINGS = 60, 20_000  # tags whose role is guessed, and readings of each
 STRONG = 25.0  # strength of an answer, as SEEN of excitation, for a guess
 LOOP = re.compile(r"^(?P<loop>.*?)[ ._:/-]+[A-Za-z ]+$")
 

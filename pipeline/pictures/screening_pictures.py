@@ -78,7 +78,7 @@ COLOURS = {
 LINE = "#0072b2"
 POINTS = 3000  # of a line; more are drawn by their extremes
 PANEL, HEAD = 1.35, 1.0  # inches
-MOST_PANELS, MOST_DETAILS = 8, 6
+MOST_PANELS, MOST_DETAILS = 8, 6  # tags that are drawn whole, and stretches that are drawn near
 MOST_SPANS = 400  # spans of one reason that are drawn, and pieces of a line before it is thinned
 AROUND, AROUND_SHARE = 25, 0.6  # rows beside a detail, or this share of its length
 

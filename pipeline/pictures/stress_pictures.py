@@ -13,7 +13,7 @@ from loopwright.pipeline.pictures.drawing import STYLE, scale, signal_label, sym
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.simulate import Trajectory
 
-PANELS, COLUMNS, TICKS = 6, 3, 4
+PANELS, COLUMNS, TICKS = 6, 3, 4  # of a picture, in a row of it, and of an axis
 BLUE, RED, GREY, GOLD = "#0072b2", "#d55e00", "#7f7f7f", "#e69f00"
 
 

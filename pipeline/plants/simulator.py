@@ -1,4 +1,4 @@
-"""The signals of a plant: all that reading a record, training a model and most laws need of it."""
+"""A plant as a closed loop needs it: its signals, where it starts, one step, and what is measured."""
 
 from __future__ import annotations
 

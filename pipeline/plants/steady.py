@@ -1,4 +1,4 @@
-"""Steady states of a plant with one MV and one CV: every branch, and where branches meet."""
+"""Steady states of a plant with one MV and one CV: every branch, where branches meet, and the plant near one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables on disk: named columns in Parquet or CSV, and errors that name file, column and row."""
+"""Tables on disk, named columns in Parquet or CSV, and the set points that lie in a file beside a record."""
 
 from __future__ import annotations
 

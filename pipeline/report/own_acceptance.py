@@ -1,4 +1,4 @@
-"""Reasons against a shipped controller: tests in which it is worse than the baseline, or swings to the end."""
+"""Requirements on the controllers of an own plant, and reasons against one that is shipped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The figures of a stage that a run shows as metrics: about ten, the ones that decide something.
+"""The note and the figures at the top of a run's page: about ten, the ones that decide something.
 
 All other figures stand in the run's artifacts: metrics.json or validation.json as the stage wrote
 it, and ``figures.json``, the same as one table of name and value.

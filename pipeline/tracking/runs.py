@@ -1,4 +1,4 @@
-"""One MLflow run for each stage result: description, data, parameters, the figures that matter, all files."""
+"""From DVC's cached results to the store: one MLflow run for each stage result that it lacks."""
 
 from __future__ import annotations
 

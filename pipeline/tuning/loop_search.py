@@ -21,7 +21,7 @@ Cost = Callable[[Sequence[Loops]], Array]
 
 SPEEDS = tuple(np.geomspace(0.5, 32.0, 10))  # closed-loop time constants, in dead times and periods
 WEIGHTS = (1.0, 0.7, 0.4)  # set-point weights that are tried first, common to all loops
-GAINS, INTEGRALS = (0.5, 0.7, 1.0, 1.4, 2.0), (0.4, 0.63, 1.0, 1.6, 2.5)
+GAINS, INTEGRALS = (0.5, 0.7, 1.0, 1.4, 2.0), (0.4, 0.63, 1.0, 1.6, 2.5)  # factors, in the first round
 DERIVATIVES, FILTERS = (0.0, 0.07, 0.15, 0.3), (0.125, 0.5)  # Td of Ti, Tf of Td
 NEAR = (0.8, 0.9, 1.0, 1.11, 1.25)  # factors of gains and integral times about the best ones, in the second round
 FINE_WEIGHTS = (

@@ -1,4 +1,4 @@
-"""How long a detector learns, and its knowledge as JSON-ready values: a loop that starts again need not learn anew."""
+"""Whether figures have moved for good from what they were while they were learnt, and how long that takes."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _shown(kept: Any) -> str:
 # ----------------------------------------------------------------------- how fast a loop is, and how long it is learnt
 SETTLE, LEAST_SETTLE, MOST_SETTLE = 100, 20, 2000  # scans
 DEAD, MOST_DEAD = 2, 200  # scans
-DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0
+DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0  # [s]
 LEARN_S = 3 * DAY_S  # that rests and blocks are learnt at least: loads of a fast plant need not be fast
 FINE_S = DAY_S  # that the fewest figures of a fast plant last at least
 NOISE = "_noise"  # how the names of the validation's tests with noise end

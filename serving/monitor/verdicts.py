@@ -71,12 +71,12 @@ def unit_of(s: Signal) -> str:
 
 # ------------------------------------------------------------------------------------------ the meaning of the figures
 MOST_HOLD = 0.02
-LEAST_SHARE, LEAST_OUTSIDE = 0.2, 0.1
+LEAST_SHARE, LEAST_OUTSIDE = 0.2, 0.1  # of the time: at limits, and outside the domain, from which on it is told
 SWINGS = 1.0  # regularity of the error's crossings above which it is a swing, if large enough too
 WORSE = 2.0  # times the validation's worst mean error: how often set points move is another matter here
 LOUD = 4.0  # times the error at rest: noise crosses zero regularly too, by chance
 PLAIN = 0.1  # of a set point's range: a swing that needs no measure of what is normal
-GAIN, ERRORS = 0.15, 4.0
+GAIN, ERRORS = 0.15, 4.0  # change of a gain, and in its standard errors, above which it is told
 RETRAIN_RATIO, RETRAIN_LEARNT = 1.5, 2.5  # of a law's own prediction; of a linear model beside it
 
 

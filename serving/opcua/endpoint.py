@@ -37,6 +37,7 @@ LEAST_LEAD, MOST_LEAD, LONGEST_LEAD_S = 0.05, 0.3, 0.5
 FADES = 0.98  # what is remembered of the slowest answer, from scan to scan
 ANSWER, LONGEST_ANSWER_S = 0.8, 5.0  # of a period: so long an answer may take
 SILENT_SCANS = 3  # without any answer: the connection is broken off and made anew
+# Pause [s] before a new connection: first, longest, times the last one.
 FIRST_RETRY_S, LAST_RETRY_S, GROWTH = 0.2, 10.0, 1.6
 
 

@@ -19,7 +19,7 @@ from loopwright.serving.words import named
 Ask: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 
 QUIET = ": still here\n\n"
-POLL_S, STATE_S, QUIET_S = 0.3, 1.0, 15.0
+POLL_S, STATE_S, QUIET_S = 0.3, 1.0, 15.0  # [s] between two looks, two states, and signs of life
 MOST_PAGES = 60  # that are sent news at a time
 LATER_MS = 30_000  # after which a page beyond them may come again
 WAITING = 100  # messages that a page that takes none may leave

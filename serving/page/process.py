@@ -16,7 +16,7 @@ from loopwright.serving.first_steps import module
 from loopwright.serving.page.settings import Page
 
 START_S = 20.0  # [s] until the page's process must have said that it serves
-FIRST_PAUSE_S, LAST_PAUSE_S = 1.0, 60.0
+FIRST_PAUSE_S, LAST_PAUSE_S = 1.0, 60.0  # [s] before the page's process is started again: first, longest
 LEAVING_S = 0.5  # in which a loop that a signal to its whole group reaches knows that it ends
 
 

@@ -57,7 +57,7 @@ class Wishes:
 # -------------------------------------------------------------------------------------------- by commands and the page
 Opened: TypeAlias = Callable[[str, str | None], Controller]  # file, its pinned SHA-256 or None
 
-LONGEST_NAME, LONGEST_REASON = 60, 300
+LONGEST_NAME, LONGEST_REASON = 60, 300  # letters
 TRIAL, LONGEST_TRIAL = 60, 1_000_000  # scans
 
 

@@ -34,6 +34,7 @@ def test_no_number_is_without_its_reason() -> None:
         ('NEAR: Final = 2 * 60\n"""[s] of a visit."""', [("NEAR", "2 * 60", "[s] of a visit.")]),
         ("NEAR = (\n    0.1  # of the range\n)", [("NEAR", "0.1", "of the range")]),
         ("ENDS = (0, 1)", [("ENDS", "(0, 1)", "")]),
+        ("LOW, NAME, HIGH = 0.1, 'a', 2  # of it", [("LOW", "0.1", "of it"), ("HIGH", "2", "of it")]),
         ("NAME = 'a'\nNONE = ()\nON = True\nnear = 0.1\nSUM = NEAR + 1", []),
     ],
 )

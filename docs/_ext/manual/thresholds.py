@@ -27,9 +27,8 @@ def thresholds_of(source: str) -> Iterator[Threshold]:
     body, remarks = ast.parse(source).body, _remarks(source)
     lines = source.splitlines()
     for i, node in enumerate(body):
-        target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
-        value = getattr(node, "value", None)
-        if not (isinstance(target, ast.Name) and value is not None and target.id.isupper() and _number(value)):
+        pairs = list(_pairs(node))
+        if not pairs:
             continue
         after = body[i + 1] if i + 1 < len(body) else None
         text = after.value.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else ""
@@ -38,8 +37,21 @@ def thresholds_of(source: str) -> Iterator[Threshold]:
         while k in remarks and lines[k - 1].lstrip().startswith("#") and not own:
             above.insert(0, remarks[k])
             k -= 1
-        said = own or above or [str(text)]
-        yield Threshold(target.id, ast.unparse(value), " ".join(" ".join(said).split()))
+        why = " ".join(" ".join(own or above or [str(text)]).split())
+        yield from (Threshold(name, ast.unparse(value), why) for name, value in pairs)
+
+
+def _pairs(node: ast.stmt) -> Iterator[tuple[str, ast.expr]]:
+    """The names that a statement binds to numbers: one, or as many as a line has."""
+    target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+    value = getattr(node, "value", None)
+    if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+        found = list(zip(target.elts, value.elts, strict=True))
+    else:
+        found = [(target, value)]
+    for name, number in found:
+        if isinstance(name, ast.Name) and name.id.isupper() and number is not None and _number(number):
+            yield name.id, number
 
 
 def thresholds() -> str:

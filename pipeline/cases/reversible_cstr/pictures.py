@@ -1,4 +1,4 @@
-"""The reference models that a search found, beside those of the classic tables: a picture and a check."""
+"""Pictures of loops that follow a reference model: levels, disturbances, training, and the models themselves."""
 
 from __future__ import annotations
 

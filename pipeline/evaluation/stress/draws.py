@@ -1,4 +1,8 @@
-"""The draw of one loop: the plant, the test, the noise and the actuator's fault."""
+"""The draw of one loop: the plant, the test, the noise and the actuator's fault.
+
+The kinds of faults are the ones that a control valve shows in the field: it sticks for a while, its zero or its span is
+out of adjustment, or its drive is slow. A fault is one of one MV.
+"""
 
 from __future__ import annotations
 

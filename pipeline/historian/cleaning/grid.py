@@ -15,7 +15,7 @@ from loopwright.pipeline.historian.files.numbers import Codes
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.metrics import Array
 
-MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20
+MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20  # in all, and for each reading: a record of more is mostly filled in
 THINNED = 1.9  # readings a period from which PVs are averaged
 LEAST_PIECE = 2  # rows
 ENOUGH = 0.3  # of the usual readings of a period, for their mean

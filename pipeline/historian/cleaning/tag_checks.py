@@ -105,7 +105,7 @@ def _possible(tag: Tag) -> tuple[float, float]:
 RANGE_SLACK = 0.1  # of a PV's given range: noise at its ends
 ONE_SIDED = "one_sided"  # kind of a finding
 FEW_TEXTS, MANY_TEXTS = 3, 0.01  # texts, and their share of the readings
-LEAST_READINGS, FEW_NEIGHBOURS = 50, 8
+LEAST_READINGS, FEW_NEIGHBOURS = 50, 8  # readings of the tag, and beside its texts, below which nothing is concluded
 ONE_SIDE, END_SHARE = 0.9, 0.25  # of the texts, or of the readings beside them, at one end; the share that is an end
 MOSTLY = 0.5  # of the readings outside the given range: then the range or its unit is wrong
 

@@ -155,7 +155,7 @@ JAVA = re.compile(
     r"^(?P<month>[^\W\d_]{3,9}) (?P<day>\d{1,2}) (?P<clock>\d\d:\d\d:\d\d) ?(?P<zone>[+-]\d{4})? (?P<year>\d{4})$"
 )
 SOME = 0.05  # of the dates, whose form counts
-LEAST_YEAR, MOST_YEAR = 1990, 2100
+LEAST_YEAR, MOST_YEAR = 1990, 2100  # years that a stamp of a record may have
 ORDERS = {"dmy": ("%d", "%m", "%y"), "mdy": ("%m", "%d", "%y"), "ymd": ("%y", "%m", "%d")}
 
 

@@ -1,4 +1,4 @@
-"""Quality of a reading, as historians write it: words, flags, OPC classic codes, OPC UA status codes."""
+"""Quality of a reading as historians write it, and why a reading or a row is not used."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ CLASSIC = {0, 4, 8, 12, 16, 20, 24, 28, 32, 64, 68, 80, 84, 88, 192, 216}
 """OPC classic: the codes that are defined, without the bits of limits and of the vendor."""
 UA_CODES = 1 << 30
 """OPC UA: bits 31 and 30 are 00 for good, 01 for uncertain, 10 for bad."""
-WHOLE_SHARE, WHOLE_HEX = 100, 8
+WHOLE_SHARE, WHOLE_HEX = 100, 8  # [%] of a quality that is good, and digits of a whole status code
 MOST = 0.75  # of the rows have what is good, where nothing but its number tells it; a state of the plant has less
 MOST_QUALITIES = 1_000  # more are the values of a tag
 MOST_STATES = 20  # numbers of a column of states; more are readings

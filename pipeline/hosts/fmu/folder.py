@@ -1,4 +1,4 @@
-"""The content of a controller FMU, as a folder and as the zip file that tools read."""
+"""The content of a controller FMU and its variables, as a folder and as the zip file that tools read."""
 
 from __future__ import annotations
 

@@ -159,7 +159,7 @@ def linearized(model: Identified, signals: Signals) -> tuple[Array, Array]:
     return slopes[:, :-1], slopes[:, -1]
 
 
-HIDDEN, ITERATIONS, TRAIN = (10,), 60, 0.8
+HIDDEN, ITERATIONS, TRAIN = (10,), 60, 0.8  # units, iterations, and the share of rows that a network is trained on
 PARTITIONS = 10  # of the inverse
 
 

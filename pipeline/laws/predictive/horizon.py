@@ -1,4 +1,4 @@
-"""A few moves of each MV that cover a horizon: their lengths, and what they cost."""
+"""The free run of an identified model over a horizon, and the few moves of each MV that cover it."""
 
 from __future__ import annotations
 

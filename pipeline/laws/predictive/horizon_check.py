@@ -22,7 +22,7 @@ LEAST_ANSWER = 0.02  # share of the largest answer of an output; smaller ones ha
 STEADY = 0.9  # share of its slope before that an output keeps which never comes to rest
 TINY = 1e-12  # smallest slope that is divided by
 SHARE = 0.9  # of the steps that the horizon is long enough for
-SHORTEST, LONGEST = 12, 50
+SHORTEST, LONGEST = 12, 50  # [samples] of a horizon that is chosen here
 EXPLODED = 100.0  # scaled; a state this large that grows on fourfold in half of BEFORE comes from an unstable model
 
 

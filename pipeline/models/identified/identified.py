@@ -1,4 +1,4 @@
-"""The identified model: a linear state space with tanh units, its scaling, its noise and its rests inside."""
+"""The identified model, a linear state space with tanh units, and how it is assembled from fitted arrays."""
 
 from __future__ import annotations
 

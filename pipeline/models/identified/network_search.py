@@ -1,4 +1,4 @@
-"""A round of the search: independent fits on the engine, their nominal cost, and what came of them."""
+"""Networks: units on the best linear candidates, ranked in rounds that keep fewer and train them longer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The choices of a candidate, the record that candidates are compared on, its fits, and how candidates are ranked."""
+"""The choices of a candidate, the record that candidates are compared on, its fits, and how candidates are ranked.
+
+Regions of an MV's range are by the gain of a PV there: where it turns its sign or fades, one number is no gain. At the
+middle of the record such a gain may be near zero by right, and the answer of a linear model is a mean over regions. So
+the models' answers are taken in cells of the MV's range, which are put together where they are alike.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recursive least squares with forgetting, its covariance in square-root form and bounded."""
+"""Recursive least squares with forgetting, bounded, and the ARX model that a control law learns on with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A local model network: linear models of a plant at several operating points, blended by where it is."""
+"""Linear models of a plant around its steady states, and the local model network that blends them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Jacobians of an MLP with respect to its parameters and its inputs, for whole batches at once."""
+"""Objectives of the trainers, the one-step error or the free-run error, and the Jacobians that they need."""
 
 from __future__ import annotations
 

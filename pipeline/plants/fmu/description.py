@@ -1,4 +1,4 @@
-"""The modelDescription.xml of an FMU: its real variables, its step, and what it can do."""
+"""The modelDescription.xml of an FMU, and which of its variables are the plant's signals."""
 
 from __future__ import annotations
 
