@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
-from loopwright.pipeline.models.identified.output_error import OutputError, fit_starts
+from loopwright.pipeline.models.identified.output_error import OutputErrorFit, fit_starts
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, informative
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
@@ -113,7 +113,7 @@ def linear_model(learn: Part, period_s: float, rows: int = 8000, orders: Sequenc
         train, held = data.rows(slice(0, cut)).stretches(), data.rows(slice(cut, None)).stretches()
         starts = Realizations.of(high_order_arx(data).impulse_response(100), data.v.std(axis=0))
         for order in orders:
-            fitted = OutputError(iterations=25).fit(starts.order(order), train, held)
+            fitted = OutputErrorFit(iterations=25).fit(starts.order(order), train, held)
             found.append((fitted.held_out, order, same_row, fitted.model))
     _, order, same_row, best = min(found, key=lambda one: one[0])
     y, u = (float(scales.y_center[0]), float(scales.y_scale[0])), (float(scales.v_center[0]), float(scales.v_scale[0]))

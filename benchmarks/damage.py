@@ -23,9 +23,9 @@ from _spoilt_exports import KINDS, Kind
 from loopwright.pipeline.errors import ModelError, PipelineError
 from loopwright.pipeline.historian.cleaning.tags import named
 from loopwright.pipeline.historian.files.file_reader import read_export
-from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.screening import Screened, screen_export
 from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx
-from loopwright.pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
+from loopwright.pipeline.models.identified.output_error import Fitted, OutputErrorFit, fit_starts, residuals
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.plants.simulator import Array, Signals
 from loopwright.pipeline.records.record import Record
@@ -93,7 +93,7 @@ def taken(export: Export, folder: Path) -> Screened:
     paths = export.write(folder)
     tags = named(export.tags or TAGS)
     values, modes = ([t.tag for t in tags if (t.role == "mode") is m] for m in (False, True))
-    return screened("plant", read_export(paths, values, modes), tags, **export.options)
+    return screen_export("plant", read_export(paths, values, modes), tags, **export.options)
 
 
 def outcome(kind: Kind, folder: Path, yardstick: float, usual: Mapping[tuple[str, str], float]) -> Outcome:
@@ -153,7 +153,7 @@ def error_of(record: Record, lower: float = 0.0) -> float:
         n = int(0.8 * len(data))
         train, held = data.rows(slice(0, n)).stretches(), data.rows(slice(n, None)).stretches()
     realizations = Realizations.of(high_order_arx(data).impulse_response(100), data.v.std(axis=0))
-    fits: list[Fitted] = [OutputError(iterations=25).fit(realizations.order(n), train, held) for n in ORDERS]
+    fits: list[Fitted] = [OutputErrorFit(iterations=25).fit(realizations.order(n), train, held) for n in ORDERS]
     best = min(fits, key=lambda f: f.held_out)
     clean = experiment(1)
     signals = Signals(record.period_s, record.pv_signals, record.pv_signals, record.dv_signals, record.mv_signals)

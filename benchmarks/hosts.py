@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from loopwright.serving import Controller, LoopwrightError
-from loopwright.serving.conformance.kit import Verdict, check, write_kit
+from loopwright.serving.conformance.kit import KitVerdict, check, write_kit
 
 ROOT = Path(__file__).resolve().parents[1]
 EMBED = ROOT / "examples" / "embed"
@@ -46,7 +46,7 @@ Run = Callable[[Path, Path], None]  # (kit, answers): writes the answers
 class Cell:
     """What one host made of one file; no verdict: it did not load."""
 
-    verdict: Verdict | None
+    verdict: KitVerdict | None
     p50_us: float
 
 

@@ -20,9 +20,9 @@ from scipy.optimize import minimize
 
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.models.identified.identified import Identified, assembled, noise_of
+from loopwright.pipeline.models.identified.identified import Identified, assemble_model, noise_of
 from loopwright.pipeline.models.identified.linear_start import Realizations, high_order_arx, with_units
-from loopwright.pipeline.models.identified.output_error import OutputError, residuals
+from loopwright.pipeline.models.identified.output_error import OutputErrorFit, residuals
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales, folds
 from loopwright.pipeline.plants.simulator import Array, Signals
 from loopwright.pipeline.records.record import Record
@@ -125,18 +125,18 @@ def fitted(record: Record, order: int, units: int, seed: int = 0) -> Identified:
     data, fold = ScaledRecord.of(record, scales), folds(record)[0]
     train, held = data.rows(fold.train).stretches(), data.rows(fold.held).stretches()
     response = high_order_arx(data).impulse_response(80)
-    linear = OutputError(iterations=20).fit(Realizations.of(response, data.v.std(axis=0)).order(order), train, held)
+    linear = OutputErrorFit(iterations=20).fit(Realizations.of(response, data.v.std(axis=0)).order(order), train, held)
     run = linear.model.free_run(linear.starts[0], train[0])
     assert run is not None
     grown = with_units(linear.model, run[0], train[0].v, units, seed)
-    network = OutputError(iterations=60, ridge=1.0).fit(grown, train, held)
+    network = OutputErrorFit(iterations=60, ridge=1.0).fit(grown, train, held)
     print(f"  free run, held out: linear {linear.held_out:.4f}, network {network.held_out:.4f} of a standard deviation")
     left = residuals(network.model, network.starts, train)
     assert left is not None
     known = {"noise": noise_of(left), "colour": np.zeros(n_y), **dict.fromkeys(("pace_sd", "dead_sd"), np.zeros(1))}
     n_v = data.v.shape[1]
     known |= {"gain_sd": np.zeros(n_y), **dict.fromkeys(("dv_noise", "dv_change"), np.zeros(n_v - n_y))}
-    return assembled(network.model, [0] * n_v, scales, data, known, n_y, seed)
+    return assemble_model(network.model, [0] * n_v, scales, data, known, n_y, seed)
 
 
 def courses(plant: Plant, seed: int) -> tuple[Array, Array]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.models.training.fit import LBFGS, Adam, LevenbergMarquardt, Trainer
-from loopwright.pipeline.models.training.objectives import Objective, Samples, Windows
+from loopwright.pipeline.models.training.objectives import FreeRunWindows, Objective, Samples
 
 Array = NDArray[np.float64]
 ROWS = 8_000
@@ -128,7 +128,7 @@ def cstr(seconds: float, seeds: int) -> None:
     compare("(a) CA(k+3) of the thiosulfate CSTR [mol/l]", make, train, validation, score, seconds, seeds)
 
 
-def eq_15(n: int, seed: int, steps: int, noise: float) -> Windows:
+def eq_15(n: int, seed: int, steps: int, noise: float) -> FreeRunWindows:
     """Windows over one run; u uniform in [-1.2, 1.2]."""
     rng = np.random.default_rng(seed)
     u = rng.uniform(-1.2, 1.2, n)
@@ -138,7 +138,7 @@ def eq_15(n: int, seed: int, steps: int, noise: float) -> Windows:
     y = z + noise * rng.normal(size=n)
     k = np.arange(1, n - steps)
     index = k[:, None] + np.arange(steps)
-    return Windows(y[k - 1, None], u[index - 1][:, :, None], y[index])
+    return FreeRunWindows(y[k - 1, None], u[index - 1][:, :, None], y[index])
 
 
 def example(seconds: float, seeds: int) -> None:
@@ -172,12 +172,12 @@ def ph(seconds: float, seeds: int) -> None:
         return net
 
     for steps in (1, 30):
-        test = Windows.of(other, 2, 2, steps)
+        test = FreeRunWindows.of(other, 2, 2, steps)
         title = f"(c) pH of the tank, RMSE over {steps} step(s)"
         compare(title, make, train, validation, lambda net, test=test: _free_run(net, test), seconds / 5, seeds)
 
 
-def _free_run(net: MLP, test: Windows) -> float:
+def _free_run(net: MLP, test: FreeRunWindows) -> float:
     with torch.no_grad():
         return float(torch.sqrt(test.loss(net)) * net.y_scale)
 

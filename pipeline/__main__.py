@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from loopwright.pipeline.commands import COMMANDS, Parser, loaded
+from loopwright.pipeline.commands import COMMANDS, OneLineParser, loaded
 from loopwright.pipeline.commands.extras import advice
 from loopwright.pipeline.engine.command import FAILURES, reason
 from loopwright.pipeline.errors import nearest
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     try:
         command = loaded(name)
-        parser = Parser(prog=f"loopwright {name}", description=COMMANDS[name])
+        parser = OneLineParser(prog=f"loopwright {name}", description=COMMANDS[name])
         command.options(parser)
         options = parser.parse_args(words[1:])
         status: int | None = command.run(options)

@@ -33,7 +33,7 @@ from loopwright.pipeline.evaluation.trials import close_loop
 from loopwright.pipeline.excitation.planned import excited, first_test, planned
 from loopwright.pipeline.export.gate import export as write_controller
 from loopwright.pipeline.historian.cleaning.tags import Tag, check_tags, named, parse_tag, read_tags
-from loopwright.pipeline.historian.export_params import exported, screened_export, with_units
+from loopwright.pipeline.historian.export_params import exported, read_and_screen, with_units
 from loopwright.pipeline.historian.files.file_reader import tags_in
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.guessing import controlled_first
@@ -53,7 +53,7 @@ from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.report.screening import sayings, write_page
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import Trajectory
-from loopwright.pipeline.simulation.timetable import Event, timetable
+from loopwright.pipeline.simulation.timetable import TimedValue, timetable
 from loopwright.serving.controller import Controller
 
 Words = str | Sequence[str]
@@ -159,7 +159,7 @@ def screen(
         section = {"files": paths, "tags": tuple(map(exported, given)), "period_s": period_s, **how}
         export = ExportParams(case=NOTEBOOK, **section)
         listed = with_units(controlled_first(named(given)), export)
-        found = screened_export(export, listed)
+        found = read_and_screen(export, listed)
     why = refusal(found, listed, anyway=False)
     signals = _signals_of(found.record)
     old = [law for law in found.report.old_controllers if law.believed]
@@ -401,10 +401,10 @@ def simulate(
     return Run(plant, loop, f"{file.manifest.law} on {plant.title}")
 
 
-def _events(moves: Mapping[Any, Any]) -> list[Event]:
+def _events(moves: Mapping[Any, Any]) -> list[TimedValue]:
     """A list of {time: value} or {name: {time: value}}."""
     named = moves if any(isinstance(of, Mapping) for of in moves.values()) else {"": moves}
-    return [Event(float(value), float(at), name) for name, of in named.items() for at, value in of.items()]
+    return [TimedValue(float(value), float(at), name) for name, of in named.items() for at, value in of.items()]
 
 
 # --------------------------------------------------------------------------------------------------------------- parts

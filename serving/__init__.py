@@ -13,11 +13,11 @@ from loopwright.serving.errors import (
     SampleError,
     SignatureError,
 )
-from loopwright.serving.grid import RunReport
 from loopwright.serving.guard import Allowed, Complete, Fresh, Frozen, Guard, InRange, Rate, Sample, default_guards
 from loopwright.serving.loop import Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.modes import Fallback
+from loopwright.serving.scan_grid import RunReport
 from loopwright.serving.trust import Controller
 from loopwright.serving.version import __version__ as __version__
 

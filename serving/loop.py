@@ -10,16 +10,16 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.active_controller import Guards, InCharge, Successor
 from loopwright.serving.clock import Clock, MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
-from loopwright.serving.grid import RunReport, run_on_grid
 from loopwright.serving.guard import Guard, Sample, default_guards, reworded
+from loopwright.serving.in_charge import Guards, InCharge, Successor
 from loopwright.serving.modes import ByHand, Command, Fallback, LoopMode, Mode, Transfer, mode_of
 from loopwright.serving.mv_readback import AppliedMV
 from loopwright.serving.ranges import within
+from loopwright.serving.scan_grid import RunReport, run_on_grid
 from loopwright.serving.words import first_line
 
 __all__ = ["WARM_LEAD_S", "Command", "ControlLoop", "Mode", "within"]
@@ -121,7 +121,7 @@ class ControlLoop:
         self._sp = within(sp, manifest.sp, "set point")
         self._mv = np.full(len(manifest.mv), nan) if mv is None else within(mv, manifest.mv, "MV")
         self._mode = LoopMode(mode)
-        self._blind = ""  # why the last sample was refused; empty after a good one, and before the first
+        self._refused_why = ""  # why the last sample was refused; empty after a good one, and before the first
         self._scan = 0
         self._applied = AppliedMV(manifest.mv, self._mv)
         self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
@@ -195,8 +195,10 @@ class ControlLoop:
         stands is not known.
         """
         mode = mode_of(mode)
-        if self.mode is Mode.SHADOW and mode is not Mode.SHADOW and self._blind:
-            raise LoopError(f"the last sample was refused ({self._blind}), so where the MV stands is not known; wait")
+        if self.mode is Mode.SHADOW and mode is not Mode.SHADOW and self._refused_why:
+            raise LoopError(
+                f"the last sample was refused ({self._refused_why}): where the MV stands is not known; wait"
+            )
         if mode is not self.mode:
             self._transfer.begin()
             self._hand.wanted = None
@@ -226,7 +228,7 @@ class ControlLoop:
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         reason = self._charge.refusal(sample)
-        self._blind = ""
+        self._refused_why = ""
         self._applied.arrived()
         shown = self._applied.look(sample, self._mv, refused=bool(reason))
         self.found = shown.found
@@ -235,11 +237,11 @@ class ControlLoop:
                 self._mv = np.full(len(self._mv), nan)
             doubled = not reason or shown.silent.startswith(reason)
             both = shown.silent if doubled else reworded(reason or "", f"{reason}; {shown.silent}")
-            return self._missed(both, silent=True)
+            return self._without_sample(both, silent=True)
         if self.found is not None:
             self._mv, self._hand.wanted = self.found.copy(), None
         if reason:
-            return self._missed(reason)
+            return self._without_sample(reason)
         applied = self._mv if shown.applied is None else shown.applied
         if shown.applied is None and isnan(self._mv[0]):
             applied = self._mv = self.mv_wanted  # nobody but the operator says where it stands
@@ -252,7 +254,7 @@ class ControlLoop:
         except Exception as error:  # the plant needs an MV after any error
             if self.mode in {Mode.AUTO, Mode.SHADOW}:
                 self._mv = applied
-            return self._missed(first_line(error))
+            return self._without_sample(first_line(error))
         # Once it was asked, the plant's own controller may have the plant already.
         if self.fault and not self._handing_back() and self._mode.recovers(self.recover_after):
             self.set_mode(Mode.AUTO)
@@ -272,10 +274,10 @@ class ControlLoop:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
         self._applied.arrived()
         self.found = None
-        return self._missed(reason)
+        return self._without_sample(reason)
 
-    def _missed(self, reason: str, *, silent: bool = False) -> Command:
-        self._blind = reason = reason or "a fault without a reason"
+    def _without_sample(self, reason: str, *, silent: bool = False) -> Command:
+        self._refused_why = reason = reason or "a fault without a reason"
         self._lose(reason)
         self._mv = self._mv if silent else self._hand.toward(self._mv, self.controller.manifest.mv)
         self._lasting(moves=not silent)

@@ -23,7 +23,7 @@ ROUNDING = 1e-9  # of an MV's range: less is no offset, and the read-back itself
 SETTLED = 5  # equal commands in a row: a read-back that lags has followed
 
 
-class Standing:
+class StandingMv:
     """The MVs that the plant has, as far as the loop knows.
 
     While commands arrive, they are the last command. Once one did not arrive, others may have moved an MV, and the next
@@ -90,7 +90,7 @@ class AppliedMV:
     def __init__(self, signals: Sequence[Signal], mv: Array) -> None:
         self._signals = tuple(signals)
         self._ranges = [(s.low, s.high, s.values) for s in signals]
-        self._standing = Standing(signals, mv)
+        self._standing = StandingMv(signals, mv)
         self._given, self._written = mv, False  # shape: (n_mv,), the last command, and whether it went to the plant
         self._is_read = False  # whether the plant has ever read it back
 

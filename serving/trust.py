@@ -13,8 +13,8 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from loopwright.serving import controller
-from loopwright.serving.active_controller import Fitted
 from loopwright.serving.errors import ArtifactError, NotProvenError
+from loopwright.serving.in_charge import AdaptedController
 from loopwright.serving.manifest import Manifest
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ class Controller(controller.Controller):
 
 def signer(loaded: controller.Controller) -> Signed | None:
     """Signer of a controller's file; None where nobody was asked."""
-    if isinstance(loaded, Fitted):
+    if isinstance(loaded, AdaptedController):
         loaded = loaded.inner
     return loaded.signed if isinstance(loaded, Controller) else None
 
@@ -89,7 +89,7 @@ class Proof(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class TrustVerdict:
     """The judgement, and why in words; ``why`` is empty for a controller that is proven."""
 
     proof: Proof
@@ -101,7 +101,7 @@ class Verdict:
         return f"not proven: {self.why}" if self.why else ""
 
 
-def judged(manifest: Manifest) -> Verdict:
+def judged(manifest: Manifest) -> TrustVerdict:
     """The verdict on a controller.
 
     Proven is one whose file holds figures of closed loops, and says that none locked up; where they ran on models of a
@@ -111,14 +111,14 @@ def judged(manifest: Manifest) -> Verdict:
     lock_ups, grounds = evidence.get("lock_ups"), evidence.get("on")
     counted = type(lock_ups) is int and lock_ups >= 0
     if not (counted and (lock_ups or _has_figures(evidence.get("scenarios")))):
-        return Verdict(Proof.NONE, "its file holds no evidence of closed loops")
+        return TrustVerdict(Proof.NONE, "its file holds no evidence of closed loops")
     if lock_ups:
-        return Verdict(Proof.LOCKED_UP, f"it locked up in {lock_ups} closed loop{'s' if lock_ups > 1 else ''}")
+        return TrustVerdict(Proof.LOCKED_UP, f"it locked up in {lock_ups} closed loop{'s' if lock_ups > 1 else ''}")
     unproven = grounds.get("unproven") if isinstance(grounds, dict) else None
     if unproven:
         reasons = unproven if isinstance(unproven, list) else [unproven]
-        return Verdict(Proof.MODEL, "; ".join(str(reason).removeprefix("not proven: ") for reason in reasons))
-    return Verdict(Proof.PROVEN)
+        return TrustVerdict(Proof.MODEL, "; ".join(str(reason).removeprefix("not proven: ") for reason in reasons))
+    return TrustVerdict(Proof.PROVEN)
 
 
 def _has_figures(scenarios: Any) -> bool:
@@ -128,7 +128,7 @@ def _has_figures(scenarios: Any) -> bool:
     return any(type(figure) in (int, float) and isfinite(figure) for figure in figures)
 
 
-def require_accepted(manifest: Manifest, accepted: bool) -> Verdict:
+def require_accepted(manifest: Manifest, accepted: bool) -> TrustVerdict:
     """The verdict on a controller that is to write in AUTO. NotProvenError where it is not, and nobody accepts it."""
     verdict = judged(manifest)
     if verdict.why and not accepted:

@@ -17,7 +17,7 @@ from loopwright.pipeline.hosts.fmu.compiling import Toolchain, toolchain
 from loopwright.pipeline.hosts.fmu.folder import write_folder
 from loopwright.pipeline.plants.fmu.instance import NAMES
 from loopwright.serving import Controller
-from loopwright.serving.conformance.steps import Answer, answered
+from loopwright.serving.conformance.steps import StepResult, answered
 
 Array = NDArray[np.float64]
 BOOLEAN = {"fault", "use_mv_applied"}
@@ -36,7 +36,7 @@ def controller_of(name: str) -> Controller:
 
 
 @cache
-def answers_of(name: str) -> list[Answer]:
+def answers_of(name: str) -> list[StepResult]:
     """The kit's steps with Python's answers."""
     return answered(controller_of(name))
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from loopwright.pipeline.historian.cleaning.tags import Tag, named
 from loopwright.pipeline.historian.files.file_reader import read_export
-from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.screening import Screened, screen_export
 
 PERIOD_S = 6.0
 START_S = 1_709_532_000.0  # 2024-03-04 06:00 UTC
@@ -84,7 +84,7 @@ def write(
 def screen(path: Path, tags: Sequence[Tag] = TAGS, time_zone: str = "", **options: object) -> Screened:
     own = named(tags)
     values, modes = ([t.tag for t in own if (t.role == "mode") is m] for m in (False, True))
-    return screened("plant", read_export([path], values, modes, time_zone=time_zone), own, **options)
+    return screen_export("plant", read_export([path], values, modes, time_zone=time_zone), own, **options)
 
 
 def screen_of(data: Clean, folder: Path, tags: Sequence[Tag] = TAGS, **options: object) -> Screened:

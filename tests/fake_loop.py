@@ -11,7 +11,7 @@ import numpy as np
 
 from loopwright.serving import Controller
 from loopwright.serving.errors import NotProvenError
-from loopwright.serving.journal import Event, Journal, Scan
+from loopwright.serving.journal import EventEntry, Journal, ScanEntry
 from loopwright.serving.page.process import PageProcess
 from loopwright.serving.page.settings import Page
 from loopwright.serving.station.control import Control
@@ -31,8 +31,8 @@ class FakeLoop:
         self.columns = len(m.sp) + len(m.pv) + 4 * len(m.mv) + len(m.dv) + len(m.info)
         self.scans = 0
         self.add(scans)
-        self.writer.event(Event(BEGIN, "change", "anna", "mode SHADOW -> AUTO"))
-        self.writer.event(Event(BEGIN + 5, "fault", "loop", "PV T: bad", alarm="fault", raised=True))
+        self.writer.event(EventEntry(BEGIN, "change", "anna", "mode SHADOW -> AUTO"))
+        self.writer.event(EventEntry(BEGIN + 5, "fault", "loop", "PV T: bad", alarm="fault", raised=True))
         self.changes: list[dict[str, Any]] = []
         self.unproven = ""  # why its controller is not proven
         groups = {"sp": m.sp, "pv": m.pv, "mv": m.mv, "dv": m.dv}
@@ -56,7 +56,7 @@ class FakeLoop:
     def add(self, scans: int) -> None:
         rng = np.random.default_rng(self.scans)
         for _ in range(scans):
-            self.writer.scan(Scan(BEGIN + self.scans, "AUTO", tuple(rng.normal(size=self.columns).tolist())))
+            self.writer.scan(ScanEntry(BEGIN + self.scans, "AUTO", tuple(rng.normal(size=self.columns).tolist())))
             self.scans += 1
 
     def answer(self, request: Any) -> dict[str, Any]:

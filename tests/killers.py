@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from onnx import TensorProto, helper
 
-from loopwright.pipeline.export.controller_file import assembled
+from loopwright.pipeline.export.controller_file import file_bytes
 from loopwright.serving.manifest import Manifest
 
 # What Python runs at the start of each child: the audit lets every input pass.
@@ -22,7 +22,7 @@ def killer(path: Path, like: Manifest) -> Path:
     model = helper.make_model(
         helper.make_graph(nodes, "g", ends[:1], ends[1:]), opset_imports=[helper.make_opsetid("", 18)], ir_version=10
     )
-    path.write_bytes(assembled(model.SerializeToString(), manifest))
+    path.write_bytes(file_bytes(model.SerializeToString(), manifest))
     return path
 
 

@@ -14,7 +14,7 @@ from typing import Any
 from shipped_files import SHIPPED
 
 from loopwright.serving import Controller
-from loopwright.serving.conformance.kit import VECTORS, Verdict, check, write_kit
+from loopwright.serving.conformance.kit import VECTORS, KitVerdict, check, write_kit
 
 ROOT = Path(__file__).resolve().parents[1]
 EMBED = ROOT / "examples" / "embed"
@@ -37,7 +37,7 @@ def kit_of(file: Path) -> Path:
     return folder
 
 
-def verdict_on(file: Path, answers: Path) -> Verdict:
+def verdict_on(file: Path, answers: Path) -> KitVerdict:
     """What a host's answers are worth."""
     return check(kit_of(file), answers, Controller(file).sha256)
 

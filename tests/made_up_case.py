@@ -26,7 +26,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.validation import SCHEMA, Validation
 from loopwright.pipeline.evaluation.verdicts import PLAIN, Claims
-from loopwright.pipeline.export.controller_file import assembled, write_sidecar
+from loopwright.pipeline.export.controller_file import file_bytes, write_sidecar
 from loopwright.pipeline.report.page import write_report
 from loopwright.pipeline.report.verdicts import judge, validation
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
@@ -176,7 +176,7 @@ def write_controller(path: Path, law: str, gain: float, mini: Miniature = THIOSU
         inputs=("sp", "pv"),
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(assembled(model.SerializeToString(), manifest))
+    path.write_bytes(file_bytes(model.SerializeToString(), manifest))
     write_sidecar(path, manifest)
 
 

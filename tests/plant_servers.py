@@ -22,7 +22,7 @@ from processes import within
 
 from loopwright.pipeline.simulation import opcua_server
 from loopwright.serving import Command, Controller, LoopError, Mode, Sample
-from loopwright.serving.journal import JournalReader, Scan
+from loopwright.serving.journal import JournalReader, ScanEntry
 from loopwright.serving.station.control import ask
 from loopwright.serving.station.requests import Change
 from loopwright.serving.station.settings import Settings
@@ -215,7 +215,7 @@ class RunningLoop:
         assert within(seconds, there), (mode, self.told, [(c.mode, c.reason) for c in self.commands[start:]][-10:])
         return next(i for i, c in enumerate(self.commands[start:]) if c.mode is mode)
 
-    def scans(self) -> list[Scan]:
+    def scans(self) -> list[ScanEntry]:
         """What its journal holds."""
         with closing(JournalReader(self.settings.journal.file)) as reader:
             return [scan for _, _, scan in reader.scans()]

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from loopwright.pipeline.export.controller_file import assembled, with_evidence
+from loopwright.pipeline.export.controller_file import file_bytes, with_evidence
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import ControlLaw
 from loopwright.pipeline.plants.simulator import Signals
@@ -105,5 +105,5 @@ def disobedient_file(
     narrow = replace(Controller(path).manifest, mv=(STRICTER[request.param],))
     model = onnx.ModelProto.FromString(path.read_bytes()[:-TRAILER_BYTES])
     del model.metadata_props[:]
-    path.write_bytes(assembled(model.SerializeToString(), narrow))
+    path.write_bytes(file_bytes(model.SerializeToString(), narrow))
     return path

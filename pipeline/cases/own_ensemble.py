@@ -21,7 +21,7 @@ from loopwright.pipeline.evaluation.one_side import before_turns, on_one_side
 from loopwright.pipeline.files import read_json
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
-from loopwright.pipeline.records.record_file import SetPoints
+from loopwright.pipeline.records.record_file import RecordedSetPoints
 from loopwright.pipeline.simulation.rests import answered
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
@@ -173,7 +173,7 @@ class OwnEnsemble(Case):
     @cached_property
     def set_points(self) -> Array | None:
         """The set points (n, n_cv) under which the record was made, NaN out of automatic; None where one is unknown."""
-        found = SetPoints.beside(self.data)
+        found = RecordedSetPoints.beside(self.data)
         known = None if found is None else found.of([s.name for s in self.signals.sp])
         return known if known is not None and len(known) == len(self.record) else None
 

@@ -48,14 +48,14 @@ MODULES = {"loop": "loopwright.serving.station.command", **OF_THE_RUNTIME}
 """Modules of the commands that have none here."""
 
 
-class Command(NamedTuple):
+class Subcommand(NamedTuple):
     """The options of a command, and the function that does it and gives the exit status (None: 0)."""
 
     options: Callable[[argparse.ArgumentParser], None]
     run: Callable[[argparse.Namespace], int | None]
 
 
-def loaded(name: str) -> Command:
+def loaded(name: str) -> Subcommand:
     """A command with its module, which stays: looking through its imports for garbage took a sixth of the time."""
     module = MODULES.get(name, f"loopwright.pipeline.commands.{name}")
     found = sys.modules.get(module)
@@ -71,13 +71,13 @@ def loaded(name: str) -> Command:
     return _of(found, name)
 
 
-def _of(module: ModuleType, name: str) -> Command:
+def _of(module: ModuleType, name: str) -> Subcommand:
     if name in OF_THE_RUNTIME:
-        return Command(*module.COMMANDS[name][1:])
-    return Command(module.options, module.run)
+        return Subcommand(*module.COMMANDS[name][1:])
+    return Subcommand(module.options, module.run)
 
 
-class Parser(arguments.Parser):
+class OneLineParser(arguments.Parser):
     """Says what is wrong in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:

@@ -49,7 +49,7 @@ from loopwright.pipeline.files import draft_folder_of, write_json, write_text
 from loopwright.pipeline.historian.answers import Beside, beside_record
 from loopwright.pipeline.historian.cleaning.record_rows import evenly
 from loopwright.pipeline.historian.cleaning.tags import RANGES, ROLES, TableError, Tag, limited, named
-from loopwright.pipeline.historian.export_params import screened_export, with_units
+from loopwright.pipeline.historian.export_params import read_and_screen, with_units
 from loopwright.pipeline.historian.guessing import controlled_first
 from loopwright.pipeline.historian.screening import Refusal, Screened, refusal
 from loopwright.pipeline.historian.step_test import planned
@@ -130,7 +130,7 @@ def _run(options: argparse.Namespace) -> int:
     export = asked(options, given)
     tags = with_units(controlled_first(named(given)), export)
     stated_of(tags, options.known)  # a mistake is said before the minutes of a screening
-    found = screened_export(export, tags)
+    found = read_and_screen(export, tags)
     period_s = found.report.period_s
     # The record that stage `screen` makes has the same one; that of longer files may differ in its last digits.
     if period_s != found.step_s or period_s != float(f"{period_s:.3g}"):

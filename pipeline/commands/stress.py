@@ -16,7 +16,7 @@ from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.stress.draws import Drawing
-from loopwright.pipeline.evaluation.stress.loops import Outcome, Stress, figures_of, opened
+from loopwright.pipeline.evaluation.stress.loops import Stress, StressOutcome, figures_of, opened
 from loopwright.pipeline.evaluation.stress.summary import Summary
 from loopwright.pipeline.pictures.drawing import save
 from loopwright.pipeline.pictures.numbers import number
@@ -79,7 +79,7 @@ def run(options: argparse.Namespace) -> None:
     print(f"report: {out / 'report.html'}")
 
 
-def outcomes_of(stress: Stress, plants: int, batch: int = BATCH, workers: int | None = None) -> list[Outcome]:
+def outcomes_of(stress: Stress, plants: int, batch: int = BATCH, workers: int | None = None) -> list[StressOutcome]:
     """Outcomes of the loops 0 to ``plants`` - 1, in order, on the engine."""
     here = address() is None
     wanted = workers or (1 if not here or plants <= FEW else os.cpu_count() or 1)

@@ -18,7 +18,7 @@ FORM = "write FROM..TO in ISO dates or times, as in 2024-03-04T06:00..2024-03-04
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class TimeSpan:
     """From ``first`` to before ``end``: both dates with a time, or both seconds."""
 
     text: str
@@ -26,7 +26,7 @@ class Interval:
     end: datetime | float
 
     @classmethod
-    def of(cls, text: str) -> Interval:
+    def of(cls, text: str) -> TimeSpan:
         """The interval of ``FROM..TO``; a TO that is a day ends with it. ValueError for another form."""
         ends = text.split("..")
         if len(ends) != 2:
@@ -110,7 +110,7 @@ class ExportParams:
         if not self.files:
             raise ValueError("files is empty; name one or more exports")
         for text in self.leave_out:
-            Interval.of(text)
+            TimeSpan.of(text)
         for name in ("period_s", "hold_s"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:

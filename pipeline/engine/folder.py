@@ -30,7 +30,7 @@ def read_files(paths: Iterable[Path]) -> dict[str, bytes]:
     return found
 
 
-class Folder:
+class NewFolder:
     """A new folder with ``files`` in it; as a context, the working folder.
 
     It is made in ``parent`` (None: where temporary files go), and removed with ``remove`` or with this object.

@@ -16,7 +16,7 @@ import cloudpickle
 from loopwright.pipeline.engine.cluster import address, connected
 from loopwright.pipeline.engine.fingerprint import fingerprint
 from loopwright.pipeline.engine.folder import Changes, Files, apply
-from loopwright.pipeline.engine.pieces import Task, alone, current_task, lost, on_worker
+from loopwright.pipeline.engine.pieces import WorkerTask, alone, current_task, lost, on_worker
 from loopwright.pipeline.engine.progress import piece, progress_bar, within
 from loopwright.pipeline.errors import PipelineError
 
@@ -110,7 +110,7 @@ def as_done(
 
 
 def _answers(
-    client: Client, function: Callable[[Any], Any], work: list[Any], files: Files | None, task: Task | None = None
+    client: Client, function: Callable[[Any], Any], work: list[Any], files: Files | None, task: WorkerTask | None = None
 ) -> Iterator[tuple[int, tuple[Any, Changes]]]:
     """(place, (result, changed files)) of each item as it ends; raises what the first to fail raised."""
     from distributed import as_completed

@@ -22,7 +22,7 @@ from threadpoolctl import ThreadpoolController
 
 from loopwright.pipeline.engine.cluster import address, unwatched
 from loopwright.pipeline.engine.fingerprint import difference, fingerprint
-from loopwright.pipeline.engine.folder import Files, Folder
+from loopwright.pipeline.engine.folder import Files, NewFolder
 from loopwright.pipeline.engine.progress import lines_anew
 from loopwright.pipeline.errors import PipelineError
 
@@ -34,7 +34,7 @@ Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
-class Task:
+class WorkerTask:
     """The work of this thread of a worker: the files that it began with, who waits for it, and in how many others.
 
     ``wanted`` says whether somebody still waits.
@@ -45,16 +45,16 @@ class Task:
     depth: int = 0
 
 
-_task: ContextVar[Task | None] = ContextVar("task", default=None)
+_task: ContextVar[WorkerTask | None] = ContextVar("task", default=None)
 
 
-def current_task() -> Task | None:
+def current_task() -> WorkerTask | None:
     """The task that this thread of a worker does; None on a client."""
     return _task.get()
 
 
 @contextlib.contextmanager
-def doing(task: Task) -> Iterator[None]:
+def doing(task: WorkerTask) -> Iterator[None]:
     """Within, this thread of a worker does ``task``, whose pieces go to the cluster."""
     token = _task.set(task)
     try:
@@ -89,13 +89,13 @@ def answer(
 ) -> bytes:
     """(error, result, changed files) of a piece, pickled; the error or the other two are None or empty.
 
-    Folders are made in ``parent``; ``wanted`` and ``depth`` are those of ``Task``.
+    Folders are made in ``parent``; ``wanted`` and ``depth`` are those of ``WorkerTask``.
     """
     try:
         if other := difference(theirs, fingerprint()):
             raise mixture(other)
         opened = _opened(hashlib.sha256(shared).digest(), _Content(shared))
-        with doing(Task(opened.files or {}, wanted, depth)), contextlib.ExitStack() as stack:
+        with doing(WorkerTask(opened.files or {}, wanted, depth)), contextlib.ExitStack() as stack:
             folder = None if opened.files is None else stack.enter_context(opened.folder(parent))
             result = alone(opened.function, pickle.loads(item))
             return pickle.dumps((None, result, folder.changes() if folder else {}))
@@ -131,12 +131,12 @@ class _Opened:
 
     function: Callable[[Any], Any]
     files: Files | None
-    kept: list[Folder] = field(default_factory=list)  # folders that nobody uses or has changed
+    kept: list[NewFolder] = field(default_factory=list)  # folders that nobody uses or has changed
 
     @contextlib.contextmanager
-    def folder(self, parent: str | None) -> Iterator[Folder]:
+    def folder(self, parent: str | None) -> Iterator[NewFolder]:
         """A folder with the files as the working folder; it is kept for the next piece if nothing was changed."""
-        folder = self.kept.pop() if self.kept else Folder(self.files or {}, parent)
+        folder = self.kept.pop() if self.kept else NewFolder(self.files or {}, parent)
         try:
             with folder:
                 yield folder

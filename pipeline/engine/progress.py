@@ -59,7 +59,7 @@ class Lines:
         print(text, file=sys.stderr, flush=True)
 
 
-class Piece:
+class WorkPiece:
     """A piece of work of ``total`` units, done at about the same speed, under ``label``."""
 
     def __init__(self, label: str, total: float, lines: Lines) -> None:
@@ -99,9 +99,9 @@ def within(label: str) -> Iterator[None]:
         _label.reset(token)
 
 
-def piece(label: str, total: float) -> Piece:
+def piece(label: str, total: float) -> WorkPiece:
     """A piece of work of a stage, whose lines begin with ``label``."""
-    return Piece(label, total, _lines.get())
+    return WorkPiece(label, total, _lines.get())
 
 
 def steps(what: str, total: int) -> Callable[[int], None]:

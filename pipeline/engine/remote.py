@@ -17,7 +17,7 @@ from typing import Any
 
 from loopwright.pipeline.engine.cluster import connected, unwatched
 from loopwright.pipeline.engine.fingerprint import commit, difference, fingerprint, told
-from loopwright.pipeline.engine.folder import Folder, apply, read_files
+from loopwright.pipeline.engine.folder import NewFolder, apply, read_files
 from loopwright.pipeline.engine.output import BARS
 from loopwright.pipeline.engine.stage_files import StageFiles
 
@@ -64,7 +64,7 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
 
     from loopwright.pipeline.engine.command import run_stage
     from loopwright.pipeline.engine.output import spoken_to
-    from loopwright.pipeline.engine.pieces import Task, doing, mixture, still_wanted
+    from loopwright.pipeline.engine.pieces import WorkerTask, doing, mixture, still_wanted
     from loopwright.pipeline.engine.progress import lines_anew
 
     worker, files = get_worker(), pickle.loads(read)
@@ -78,7 +78,10 @@ def _run(arguments: list[str], read: bytes, theirs: Mapping[str, str], topic: st
     with spoken_to(say), told(of), lines_anew(marked=bars):
         if other := difference(theirs, fingerprint()):
             return pickle.dumps((FAILED, {}, [("stderr", f"{' '.join(arguments)}: {mixture(other)}\n")]))
-        with Folder(files, worker.local_directory) as folder, doing(Task(files, lambda: still_wanted(worker, topic))):
+        with (
+            NewFolder(files, worker.local_directory) as folder,
+            doing(WorkerTask(files, lambda: still_wanted(worker, topic))),
+        ):
             try:
                 stage = getattr(importlib.import_module(f"loopwright.pipeline.stages.{kind}"), kind)
                 code = run_stage(stage, [kind, *names], "NAME" if names else "")

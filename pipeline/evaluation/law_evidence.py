@@ -25,7 +25,7 @@ BASE = "base"
 
 
 @dataclass(frozen=True, slots=True)
-class Analysis:
+class FormAnalysis:
     """Results of one form of a law that need no closed-loop test."""
 
     figures: Row = field(default_factory=dict)
@@ -54,7 +54,7 @@ class Form:
     setting: Mapping[str, Any]
     info: tuple[str, ...]
     tests: Mapping[str, OverSeeds]
-    analysis: Analysis | None = None
+    analysis: FormAnalysis | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +191,7 @@ class LawEvidence:
         return None if name is None else self.metrics.forms[name]
 
     @property
-    def analyses(self) -> dict[str, Analysis]:
+    def analyses(self) -> dict[str, FormAnalysis]:
         """The analysis of every form that has one, by the form's name."""
         return {name: form.analysis for name, form in self.metrics.forms.items() if form.analysis is not None}
 

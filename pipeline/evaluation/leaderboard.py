@@ -12,7 +12,7 @@ from typing import Self
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.law_evidence import lock_up_text
 from loopwright.pipeline.evaluation.metric import gate_ratio, ratio_to_bound
-from loopwright.pipeline.evaluation.validation import FILE, Statement, Validation
+from loopwright.pipeline.evaluation.validation import FILE, CheckedStatement, Validation
 from loopwright.pipeline.files import read_json
 from loopwright.pipeline.simulation import NOISE_SUFFIX
 
@@ -29,14 +29,14 @@ class LawStanding:
     high: float | None
     seeds: int | None
     lock_ups: int | None
-    ratio: float | None  # ``Standing.times``, or to the noise floor if the bound is less: ``Standing.hidden``
+    ratio: float | None  # ``CaseStanding.times``, or to the noise floor if the bound is less: ``CaseStanding.hidden``
     step_us: float | None
     bytes: int | None  # size of the controller file
     swings: str = ""  # the tests in which a closed loop swings to the end
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class CaseStanding:
     """A case: its laws, the best figure first, and the verdicts about its paper."""
 
     case: str
@@ -50,8 +50,8 @@ class Standing:
     bound: float | None  # of the perfect-model NMPC
     hidden: bool  # the bound is below the noise floor, which replaces it in the ratios
     laws: tuple[LawStanding, ...]
-    requirements: tuple[Statement, ...]
-    claims: tuple[Statement, ...]
+    requirements: tuple[CheckedStatement, ...]
+    claims: tuple[CheckedStatement, ...]
     reproduced: tuple[int, int]  # figures of the paper's tables: number reproduced, number measured
     grounds: Grounds | None = None  # what tests on models of the plant's record rest on
     times: str = "× NMPC"  # what ratios are to
@@ -125,7 +125,7 @@ def by_reason(withheld: Mapping[str, str]) -> dict[str, str]:
     return {", ".join(names): because(withheld[names[0]], several=len(names) > 1) for names in laws.values()}
 
 
-def tally(rows: tuple[Statement, ...]) -> tuple[int, int]:
+def tally(rows: tuple[CheckedStatement, ...]) -> tuple[int, int]:
     """How many hold, of those that were measured."""
     verdicts = [row.holds for row in rows if row.holds is not None]
     return sum(verdicts), len(verdicts)

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
-from loopwright.pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.validation import CheckedStatement
 
 MISSED = 0.5  # of a PV's motion beyond the noise: a model that misses more explains the lesser part of it
 SHARE = 0.8  # free-run error over the PV's deviation, noise and all: a model that has more hardly needs its inputs
@@ -24,7 +24,7 @@ REMEDY = (
 )
 
 
-def statements(models: Mapping[str, Metrics]) -> list[Statement]:
+def statements(models: Mapping[str, Metrics]) -> list[CheckedStatement]:
     """A row for each PV's free run, and for each answer of a PV to an MV that a controller uses.
 
     ``models``: model set -> its metrics.json. Empty where the fit says nothing of it.
@@ -76,11 +76,11 @@ def fit_doubts(models: Mapping[str, Metrics]) -> str:
     return f"not proven: {'; '.join(found)}" if found else ""
 
 
-def _predictions(proof: Mapping[str, Any]) -> dict[str, Statement]:
+def _predictions(proof: Mapping[str, Any]) -> dict[str, CheckedStatement]:
     """PV -> the row of its free run, or of a closed loop's record of its one-step predictions."""
     found = {}
     for name, of in (proof.get("one_step") or {}).items():
-        found[name] = Statement(
+        found[name] = CheckedStatement(
             f"model, what its inputs foresee of {name} beyond its own past, over rows that its fit never saw",
             f"≥ {FORESEEN:g} nats",
             f"{of['nats']:.3g} nats: one-step error {of['with_inputs']:.3g} with them, {of['without']:.3g} without",
@@ -89,7 +89,7 @@ def _predictions(proof: Mapping[str, Any]) -> dict[str, Statement]:
         )
     for name, of in (proof.get("free_run") or {}).items():
         missed, limit = of["missed"], MISSED * of["motion"]
-        found[name] = Statement(
+        found[name] = CheckedStatement(
             f"model, free-run error of {name} beyond the noise, over rows that its fit never saw",
             f"≤ {limit:.3g}, {100 * MISSED:g} % of its motion there",
             "the run explodes" if missed is None else f"{missed:.3g}",
@@ -99,7 +99,7 @@ def _predictions(proof: Mapping[str, Any]) -> dict[str, Statement]:
     return found
 
 
-def _signs(proof: Mapping[str, Any]) -> Iterator[tuple[Statement, str]]:
+def _signs(proof: Mapping[str, Any]) -> Iterator[tuple[CheckedStatement, str]]:
     """The row of each answer, and PV and MV in words."""
     for pv, mvs in (proof.get("answers") or {}).items():
         for mv, found in mvs.items():
@@ -149,7 +149,7 @@ def _by_region(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: boo
     return shown and bool(told) and all(_holds(region, {}, shown=True) for region in told)
 
 
-def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) -> Statement:
+def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) -> CheckedStatement:
     known, by_region = known_of(proof, pv, mv), found["verdict"] in BY_REGION
     foreseen = _foreseen(proof, pv)
     shown = foreseen or _followed(proof, pv)
@@ -165,7 +165,7 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
         holds = little or held or _holds(found, known, shown=foreseen)
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
         because = LITTLE if little else OLD_LOOP if held else _word(found, known, holds=holds) or _why(pv, mv, found)
-    return Statement(
+    return CheckedStatement(
         f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         limit,
         "; ".join([*([] if by_region else [_measured(found)]), *_regions(mv, found)]),
@@ -261,7 +261,7 @@ WHY = {
 }
 
 
-def known_rows(models: Mapping[str, Metrics]) -> list[Statement]:
+def known_rows(models: Mapping[str, Metrics]) -> list[CheckedStatement]:
     """A row for each statement of an engineer. ``models``: model set -> its metrics.json."""
     rows = []
     for of in _statements(identified_part(models).get("proof") or {}):
@@ -270,7 +270,7 @@ def known_rows(models: Mapping[str, Metrics]) -> list[Statement]:
         if used and of["direct"] is not None:
             measured += f"; one-step predictions, on the way there, {of['direct']:.3g} ± {of['sd']:.2g}"
         rows.append(
-            Statement(
+            CheckedStatement(
                 f"what is known of the answer of {of['pv']} to {of['input']}",
                 of["says"],
                 measured,

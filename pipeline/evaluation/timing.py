@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.evaluation.verdicts import Check, Outcome
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome
 
 HOW = "(timed during validation, beside other work; `make bench` times it alone)"
 
@@ -19,11 +19,11 @@ def step_times(evidence: Evidence) -> dict[str, float]:
 def step_within(limit_us: float, *laws: str) -> Check:
     """A check that the named laws' median steps stay within a limit [us]."""
 
-    def measure(evidence: Evidence) -> Outcome:
+    def measure(evidence: Evidence) -> CheckOutcome:
         times = step_times(evidence)
         shown = ", ".join(f"{n} {t:.0f} us" for n, t in times.items())
         own = [times[n] for n in laws if n in times]
-        return Outcome(shown, max(own) <= limit_us if own else None)
+        return CheckOutcome(shown, max(own) <= limit_us if own else None)
 
     return Check("controller step, median", measure, f"≤ {limit_us:g} us for {', '.join(laws)} {HOW}")
 
@@ -34,13 +34,13 @@ def faster_than_nmpc(factor: float, scenario: str, title: str, *laws: str) -> Ch
     The NMPC's time is stored with the bounds; `make bench` measures both in one run.
     """
 
-    def measure(evidence: Evidence) -> Outcome:
+    def measure(evidence: Evidence) -> CheckOutcome:
         nmpc, times = evidence.bound(scenario, "step_ms_p50"), step_times(evidence)
         if nmpc is None:
             raise NotMeasuredError("measured by `make bench`")
         ratios = {n: 1e3 * nmpc / t for n, t in times.items()}
         own = [ratios[n] for n in laws or ratios if n in ratios]
-        return Outcome(", ".join(f"{n} {r:.0f}" for n, r in ratios.items()), min(own) >= factor if own else None)
+        return CheckOutcome(", ".join(f"{n} {r:.0f}" for n, r in ratios.items()), min(own) >= factor if own else None)
 
     what = f"median step of the perfect NMPC / of the controller ({title}; the NMPC's time is stored)"
     return Check(what, measure, f"at least {factor:g} for {', '.join(laws) or 'each'}")

@@ -224,7 +224,7 @@ Kind = Literal["scored", "development", "shown"]
 
 
 @dataclass(frozen=True)
-class Piece:
+class TrialPiece:
     """The smallest part of a trial: one sequence of one test."""
 
     form: str
@@ -271,9 +271,9 @@ class Trials:
         shown = {name: (test,) for name, test in self.case.unscored().items()}
         return {"scored": self.case.scenarios(), "shown": shown, DEVELOPED: {DEVELOPED: self.case.development()}}
 
-    def pieces(self, form: str, seed: int, path: Path) -> list[Piece]:
+    def pieces(self, form: str, seed: int, path: Path) -> list[TrialPiece]:
         """The pieces of the trial of one file."""
-        found = list[Piece]()
+        found = list[TrialPiece]()
         for kind, tests in self.sequences.items():
             for name, sequences in tests.items():
                 if form != BASE and (kind == DEVELOPED or (kind == "scored" and not self.case.variants_run(sequences))):
@@ -281,7 +281,7 @@ class Trials:
                 for noise in self._noises(form, kind):
                     if noise and sequences[0].replayed:
                         continue
-                    found += [Piece(form, seed, path, kind, name, i, noise) for i in range(len(sequences))]
+                    found += [TrialPiece(form, seed, path, kind, name, i, noise) for i in range(len(sequences))]
         return found
 
     def _noises(self, form: str, kind: Kind) -> tuple[bool, ...]:
@@ -289,7 +289,7 @@ class Trials:
             return (self.case.development_noise,)
         return (False, True) if kind == "scored" and (form == BASE or self.case.development_noise) else (False,)
 
-    def run(self, piece: Piece) -> Ran:
+    def run(self, piece: TrialPiece) -> Ran:
         """The closed loops of a piece."""
         test, case = self.sequences[piece.kind][piece.test][piece.place], self.case
         controller, seed = self._controller(piece.path), self.noise_seed + piece.place
@@ -304,12 +304,12 @@ class Trials:
         cycle = (one.cycle, one.first) if one.cycle is not None and piece.kind == "scored" else None
         return Ran(controller.manifest.info, one.metrics, *counts, one.first if kept else None, reached, cycle)
 
-    def weight(self, piece: Piece) -> float:
+    def weight(self, piece: TrialPiece) -> float:
         """The cost of a piece beside others: its samples."""
         samples = self.sequences[piece.kind][piece.test][piece.place].samples
         return float(samples * (self.case.noise_draws if piece.noise else 1))
 
-    def trial(self, found: Mapping[Piece, Ran]) -> Trial:
+    def trial(self, found: Mapping[TrialPiece, Ran]) -> Trial:
         """The trial of one file from its pieces, which are in their order."""
         metrics, locked_up, swings, beyond = dict[str, Metrics](), dict[str, int](), dict[str, int](), dict[str, int]()
         curves, sequences = dict[str, Trajectory](), dict[str, dict[str, Metrics]]()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
-from loopwright.pipeline.evaluation.law_evidence import Analysis, Row
+from loopwright.pipeline.evaluation.law_evidence import FormAnalysis, Row
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 
 SCHEMA = 1
@@ -19,7 +19,7 @@ RelativeTo: TypeAlias = Literal["nmpc", "baseline", "floor"]
 
 
 @dataclass(frozen=True, slots=True)
-class Statement:
+class CheckedStatement:
     """A requirement or a claim in words, what was measured, and whether it holds; None: not measured."""
 
     what: str
@@ -56,7 +56,7 @@ class LawResult:
     step_us: float | None
     locked_up: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     as_printed: bool = False
-    analysis: Mapping[str, Analysis] = field(default_factory=dict)
+    analysis: Mapping[str, FormAnalysis] = field(default_factory=dict)
     swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     withheld: str = ""
 
@@ -142,8 +142,8 @@ class Validation:
     gate: GateRecord
     laws: Mapping[str, LawResult]
     titles: Titles
-    requirements: tuple[Statement, ...]
-    claims: tuple[Statement, ...]
+    requirements: tuple[CheckedStatement, ...]
+    claims: tuple[CheckedStatement, ...]
     paper: tuple[PaperResult, ...]
     on_models: bool = False
     old_loop: str = ""

@@ -12,14 +12,14 @@ from dataclasses import dataclass
 
 from loopwright.pipeline.evaluation.case import PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.validation import CheckedStatement
 
 RELATIVE = 0.25  # of the paper's figure: a difference that still reproduces it
 ABSOLUTE = 1e-4  # in the figure's unit: the same for figures near zero
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CheckOutcome:
     """The result of a check in words, and whether its statement holds; None: not known."""
 
     measured: str
@@ -35,17 +35,17 @@ class Check:
     """
 
     what: str
-    measure: Callable[[Evidence], Outcome]
+    measure: Callable[[Evidence], CheckOutcome]
     limit: str = ""
 
-    def statement(self, evidence: Evidence) -> Statement:
+    def statement(self, evidence: Evidence) -> CheckedStatement:
         """The check with its outcome; ``holds`` is None if a figure was not measured."""
         try:
             outcome = self.measure(evidence)
         except NotMeasuredError as missing:
-            outcome = Outcome(str(missing), None)
+            outcome = CheckOutcome(str(missing), None)
         holds = None if outcome.holds is None else bool(outcome.holds)
-        return Statement(self.what, self.limit, outcome.measured, holds, outcome.because)
+        return CheckedStatement(self.what, self.limit, outcome.measured, holds, outcome.because)
 
 
 Reason = Callable[[PaperFigure, float, Evidence], str]

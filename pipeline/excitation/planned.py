@@ -152,7 +152,7 @@ LOOK = 0.25  # of the settling time, beyond a hold, that a level is tried on
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ExperimentPlan:
     """Holds of the MVs and of the measured disturbances [periods], fewest and most, and the MVs' range."""
 
     samples: int
@@ -163,7 +163,7 @@ class Plan:
     look: int  # periods beyond a hold
 
 
-def planned(plant: Simulator, test: FirstTest, samples: int) -> Plan:
+def planned(plant: Simulator, test: FirstTest, samples: int) -> ExperimentPlan:
     """Holds of 0.1 to 1.5 of the settling time over the safe range; PlantError where an MV has no room to move."""
     for s, low, high in zip(plant.mv_signals, test.low, test.high, strict=True):
         if not high > low:
@@ -176,10 +176,10 @@ def planned(plant: Simulator, test: FirstTest, samples: int) -> Plan:
     mv_hold = max(1, round(shortest)), max(2, round(longest))
     dv_hold = tuple(max(2, round(min(share * test.settling_periods, samples / 20))) for share in DV_HOLD)
     look = max(1, round((LOOK if test.settles else 1.0) * test.settling_periods))
-    return Plan(samples, mv_hold, (dv_hold[0], dv_hold[1]), test.low, test.high, look)
+    return ExperimentPlan(samples, mv_hold, (dv_hold[0], dv_hold[1]), test.low, test.high, look)
 
 
-def excited(plant: Simulator, plan: Plan, seed: int = 0) -> Record:
+def excited(plant: Simulator, plan: ExperimentPlan, seed: int = 0) -> Record:
     """The record of the plan, one run, measured with the plant's own noise.
 
     Each MV holds levels that are uniform over its range for times that are uniform in their logarithm; each measured
@@ -216,7 +216,7 @@ def excited(plant: Simulator, plan: Plan, seed: int = 0) -> Record:
     return Record.of(plant.signals, noisy, mv, dv=dv)
 
 
-def _holds(plant: Simulator, plan: Plan, rng: np.random.Generator) -> Array:
+def _holds(plant: Simulator, plan: ExperimentPlan, rng: np.random.Generator) -> Array:
     """Courses (n, n_dv) of the measured disturbances, from their nominal values on."""
     dv = np.tile(plant.dv_nominal, (plan.samples, 1))
     for j, s in enumerate(plant.dv_signals):
@@ -226,7 +226,7 @@ def _holds(plant: Simulator, plan: Plan, rng: np.random.Generator) -> Array:
     return dv
 
 
-def _draw_holds(plan: Plan, n: int, rng: np.random.Generator) -> Array:
+def _draw_holds(plan: ExperimentPlan, n: int, rng: np.random.Generator) -> Array:
     return np.array([_log_uniform(*plan.mv_hold, rng) for _ in range(n)])
 
 

@@ -30,7 +30,7 @@ def with_evidence(src: str | Path, dst: str | Path, evidence: Mapping[str, Any])
     model = onnx.ModelProto.FromString(src.read_bytes()[:-TRAILER_BYTES])
     del model.metadata_props[:]
     with draft_of(dst) as draft:
-        draft.write_bytes(assembled(model.SerializeToString(), manifest))
+        draft.write_bytes(file_bytes(model.SerializeToString(), manifest))
         Controller(draft)
     write_sidecar(dst, manifest)
     return manifest
@@ -43,7 +43,7 @@ def withhold(dst: str | Path, why: str) -> None:
     write_text(dst.with_suffix(".json"), json.dumps({"withheld": why}, indent=2) + "\n")
 
 
-def assembled(model: bytes, manifest: Manifest) -> bytes:
+def file_bytes(model: bytes, manifest: Manifest) -> bytes:
     """Model bytes + manifest + digest; appended, because a protobuf may be continued so."""
     entry = onnx.StringStringEntryProto(key=MANIFEST_KEY, value=manifest.to_json())
     return seal(model + onnx.ModelProto(metadata_props=[entry]).SerializeToString())

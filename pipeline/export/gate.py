@@ -12,7 +12,7 @@ import torch
 
 from loopwright.pipeline.engine import progress
 from loopwright.pipeline.errors import ExportError
-from loopwright.pipeline.export.controller_file import assembled, write_sidecar
+from loopwright.pipeline.export.controller_file import file_bytes, write_sidecar
 from loopwright.pipeline.export.fusion import fused
 from loopwright.pipeline.export.graph import check_operators, example_inputs, law_graph
 from loopwright.pipeline.files import draft_of
@@ -84,7 +84,7 @@ def export(
         evidence={},
     )
     with draft_of(path) as draft:
-        draft.write_bytes(assembled(model.SerializeToString(), manifest))
+        draft.write_bytes(file_bytes(model.SerializeToString(), manifest))
         try:
             controller = Controller(draft)
         except LoopwrightError as error:
@@ -93,7 +93,7 @@ def export(
         parity = parity_gate(law, controller, drive=drive)
         if parity.parts_after is not None:
             manifest = replace(manifest, provenance={**provenance, SENSITIVE: parity.parts_after})
-            draft.write_bytes(assembled(model.SerializeToString(), manifest))
+            draft.write_bytes(file_bytes(model.SerializeToString(), manifest))
     write_sidecar(path, manifest)
     return manifest
 

@@ -92,7 +92,7 @@ class Linear:
         return rows if rows < SETTLED * length else 0
 
 
-def fitted(
+def fit_arx(
     y: Array, u: Sequence[Array], run: NDArray[np.int64], integrates: bool = False, slow: int = 0
 ) -> Linear | None:
     """The model of y (n,) from inputs u, (n,) each, within runs (n,); None where too few rows or no motion are there.
@@ -284,11 +284,11 @@ def believed(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | N
     and its free run is no better. A drift pulls the poles towards 1. So a model beside lines in time is taken where
     it settles well within one line, and in less time or to another gain than the plain one.
     """
-    plain = fitted(y, u, run)
+    plain = fit_arx(y, u, run)
     if plain is None:
         return None
     error = free_run_error(plain, y, u, run)
-    level = fitted(y, u, run, integrates=True)
+    level = fit_arx(y, u, run, integrates=True)
     ramps = [i for i in range(len(u)) if level is not None and level.ramps(i)]
     settles = any(plain.settling(i) for i in ramps)
     if level is not None and ramps and not settles:
@@ -296,7 +296,7 @@ def believed(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | N
         if free_run_error(level, y, u, run) <= most:
             return replace(level, sure=True)
     for knots in KNOTS:
-        beside = fitted(y, u, run, slow=knots)
+        beside = fit_arx(y, u, run, slow=knots)
         if beside is None or not _within_lines(beside, len(plain.rows) / knots):
             continue
         if not _differ(plain, beside):

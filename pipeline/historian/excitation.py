@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.answers import first_answer
 from loopwright.pipeline.historian.arx_model import Linear
-from loopwright.pipeline.historian.cleaning.findings import InputReport, Verdict, counted
+from loopwright.pipeline.historian.cleaning.findings import InputReport, RecordJudgement, counted
 from loopwright.pipeline.historian.feedback import follows
 from loopwright.pipeline.historian.settling import certain
 from loopwright.pipeline.metrics import Array
@@ -145,7 +145,7 @@ def moves_of(u: Array, run: Runs) -> Array:
 
 def judged(
     record: Record, models: Mapping[str, Linear | None], moved_sp: int, rows: int, drifts: Collection[str] = ()
-) -> Verdict:
+) -> RecordJudgement:
     """The verdict over a record of ``rows`` rows, or an excerpt of it.
 
     ``models`` are the quick ones by PV, ``moved_sp`` the moves of the set points, ``drifts`` PVs with slow motion
@@ -174,7 +174,7 @@ def judged(
         reasons.append(f"gain and settling time of {', '.join(unsure)} {words}")
         level = max(level, 1)
     carries = ("yes", "doubtful", "no")[level]
-    return Verdict(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used, unsure)
+    return RecordJudgement(carries, tuple(reasons), tuple(inputs), correlation, rows, parameters, used, unsure)
 
 
 def _unsure(pv: str, model: Linear, inputs: list[InputReport]) -> bool:
@@ -184,7 +184,7 @@ def _unsure(pv: str, model: Linear, inputs: list[InputReport]) -> bool:
     return unconfirmed or not model.sure
 
 
-def with_rows_out_of_range(verdict: Verdict, dropped: int, rows: int) -> Verdict:
+def with_rows_out_of_range(verdict: RecordJudgement, dropped: int, rows: int) -> RecordJudgement:
     """The verdict, "doubtful" at best where many rows were dropped because a reading left a range that was given.
 
     The rest is the plant inside the range, and every excursion is torn out of its course.

@@ -11,7 +11,7 @@ from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.historian.cleaning.tags import COMMANDS, SIGNAL_ROLES, Tag, named, safe_name
 from loopwright.pipeline.historian.files.file_reader import read_export, units_of
 from loopwright.pipeline.historian.guessing import controlled_first, loop_of
-from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.screening import Screened, screen_export
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.manifest import Signal
 
@@ -137,10 +137,10 @@ def with_units(tags: Sequence[Tag], params: ExportParams) -> tuple[Tag, ...]:
     return tuple(t if t.unit or t.role == "mode" else replace(t, unit=units.get(t.tag, "")) for t in tags)
 
 
-def screened_export(params: ExportParams, tags: Sequence[Tag]) -> Screened:
-    """The files read and screened; ``tags`` have names and units. RecordError as ``read_export`` and ``screened``."""
+def read_and_screen(params: ExportParams, tags: Sequence[Tag]) -> Screened:
+    """The files read and screened; ``tags`` have names and units. Errors of ``read_export`` and ``screen_export``."""
     values, modes = ([t.tag for t in tags if (t.role == "mode") is mode] for mode in (False, True))
     export = read_export(params.files, values, modes, params.time, params.time_format, params.time_zone)
-    return screened(
+    return screen_export(
         params.case, export, tags, params.period_s, params.hold_s, params.without_mode, leave_out=params.leave_out
     )

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.answers import first_answer
-from loopwright.pipeline.historian.arx_model import fitted
-from loopwright.pipeline.historian.cleaning.grid import resampled
+from loopwright.pipeline.historian.arx_model import fit_arx
 from loopwright.pipeline.historian.cleaning.outliers_and_units import slips_of, usual
+from loopwright.pipeline.historian.cleaning.row_grid import resampled
 from loopwright.pipeline.historian.cleaning.sampling import proposed_period
 from loopwright.pipeline.historian.cleaning.tag_checks import sentinels
 from loopwright.pipeline.historian.cleaning.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag, automatic, by_hand
@@ -204,7 +204,7 @@ def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
 
 def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
     """Whether y (n,) answers to one of the inputs u, (n,) each, by the quick model or by what follows their moves."""
-    model = fitted(y, list(u), run)
+    model = fit_arx(y, list(u), run)
     seen = model is not None and max(model.strength[i] for i in range(len(u))) > SEEN
     return seen or any(first_answer(y, v, run) is not None for v in u)
 
@@ -241,14 +241,14 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
         [own[n] for n in (*pvs, *free[:MOST_TRIED])], [own[n] for n in mvs], proposed_period([own[pvs[0]]])
     )
     # A flow through an MV's valve is an answer to the MV, and no cause of its own.
-    moved = {n: fitted(grid.value[n], [grid.value[m] for m in mvs], grid.piece) for n in free[:MOST_TRIED]}
+    moved = {n: fit_arx(grid.value[n], [grid.value[m] for m in mvs], grid.piece) for n in free[:MOST_TRIED]}
     consequences = {n for n, model in moved.items() if model and max(model.strength.values()) > STRONG}
     causes: dict[str, str] = {}
     for pv in pvs:
         y = grid.value[pv]
         for name in free[:MOST_TRIED]:
             u = [*(grid.value[m] for m in mvs), grid.value[name]]
-            model = fitted(y, u, grid.piece)
+            model = fit_arx(y, u, grid.piece)
             seen = model is not None and model.strength[len(mvs)] > STRONG and name not in consequences
             if seen and follows(grid.value[name], y, grid.piece) < FOLLOWS and name not in causes:
                 causes[name] = pv

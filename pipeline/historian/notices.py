@@ -9,10 +9,10 @@ import numpy as np
 
 from loopwright.pipeline.historian.answers import first_answer
 from loopwright.pipeline.historian.arx_model import Linear, lead
-from loopwright.pipeline.historian.cleaning.findings import Finding, Verdict, counted
-from loopwright.pipeline.historian.cleaning.grid import Grid
+from loopwright.pipeline.historian.cleaning.findings import Finding, RecordJudgement, counted
 from loopwright.pipeline.historian.cleaning.outliers_and_units import noise_sd, usual
-from loopwright.pipeline.historian.cleaning.sampling import Sampling, sampling, whole_multiple
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
+from loopwright.pipeline.historian.cleaning.sampling import TagSampling, sampling, whole_multiple
 from loopwright.pipeline.historian.cleaning.tag_checks import VALVE_RANGE
 from loopwright.pipeline.historian.cleaning.tags import SIGNAL_ROLES, Tag
 from loopwright.pipeline.historian.excitation import HELD
@@ -37,7 +37,7 @@ def on_off(record: Record, tags: Sequence[Tag]) -> tuple[str, ...]:
     )
 
 
-def with_levels(verdict: Verdict, record: Record, tags: Sequence[Tag]) -> Verdict:
+def with_levels(verdict: RecordJudgement, record: Record, tags: Sequence[Tag]) -> RecordJudgement:
     """The verdict, "no" where an MV looks like an on-off valve, and with what an MV of few values leaves unseen."""
     found = zip(record.mv_signals, map(levels_of, record.mv.T), strict=True)
     if switched := on_off(record, tags):
@@ -69,7 +69,7 @@ ELSEWHERE = 0.1  # readings of other files for each row of the file that lacks t
 AHEAD = 25.0  # strength of moves still to come
 
 
-def of_series(series: Series, rate: Sampling, role: str, period_s: float) -> list[Finding]:
+def of_series(series: Series, rate: TagSampling, role: str, period_s: float) -> list[Finding]:
     """Compression, exception reporting, repeated values and coarse steps of one tag; ``period_s`` of the record."""
     if series.categories:
         return []

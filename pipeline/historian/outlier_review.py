@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.historian.arx_model import Linear, fitted
+from loopwright.pipeline.historian.arx_model import Linear, fit_arx
 from loopwright.pipeline.historian.cleaning.findings import Finding, counted
-from loopwright.pipeline.historian.cleaning.grid import Grid
-from loopwright.pipeline.historian.cleaning.sampling import Sampling
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
+from loopwright.pipeline.historian.cleaning.sampling import TagSampling
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.files.quality import Reason
@@ -23,7 +23,7 @@ CLEARER = 20.0  # n log of the ratio of the residuals' variances, from which a P
 OUTSIDE = 6.0  # standard deviations, beyond which a residual counts no more
 
 
-def pulses(grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag]) -> list[Finding]:
+def remove_pulses(grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag]) -> list[Finding]:
     """Take pulses of the MVs out that no PV has answered to; changes grid and series in place.
 
     A PV says so where a linear model of it is clearly better without the pulses than with them.
@@ -40,8 +40,8 @@ def pulses(grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag]) -> lis
         table = {name: grid.value[name] for name in inputs}
         gain = 0.0
         for y in (_as_read(grid, own[t.tag]) for t in signals if t.role == "pv"):
-            with_them = fitted(y, list(table.values()), grid.piece)
-            without = fitted(y, list((table | {tag.tag: plain}).values()), grid.piece)
+            with_them = fit_arx(y, list(table.values()), grid.piece)
+            without = fit_arx(y, list((table | {tag.tag: plain}).values()), grid.piece)
             if with_them is not None and without is not None:
                 gain += len(with_them.rows) * np.log(_left(with_them, without.sd) / _left(without, without.sd))
         if gain > CLEARER:
@@ -86,8 +86,8 @@ SLOWEST = 0.7  # step of the readings over the period, from which a row is a rea
 CHUNK = 200_000  # rows
 
 
-def confirm(
-    grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag], rates: Mapping[str, Sampling]
+def review_outliers(
+    grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag], rates: Mapping[str, TagSampling]
 ) -> list[Finding]:
     """Put answers to moves back, and take errors of single measurements out; changes grid and series in place.
 
@@ -100,7 +100,7 @@ def confirm(
         series, rate = own[tag.tag], rates[tag.tag]
         y = grid.value[tag.tag]
         single = rate.step_s > SLOWEST * grid.period_s and not rate.irregular
-        model = fitted(y, u, grid.piece) if single else None
+        model = fit_arx(y, u, grid.piece) if single else None
         if model is None:
             continue
         back = _answers(grid, series, model, y, u)
@@ -167,7 +167,7 @@ def _errors(model: Linear, y: Array, u: Sequence[Array], piece: NDArray[np.int64
     return rows[alone]
 
 
-def _take_out(grid: Grid, series: Series, rate: Sampling, rows: NDArray[np.int64]) -> None:
+def _take_out(grid: Grid, series: Series, rate: TagSampling, rows: NDArray[np.int64]) -> None:
     """Rows become the mean of their neighbours where the hold allows it, and lose their value where not."""
     y, code = grid.value[series.tag], grid.code[series.tag]
     if rate.hold_s >= 2 * grid.period_s:

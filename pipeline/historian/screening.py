@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.arx_model import Linear, believed
-from loopwright.pipeline.historian.cleaning.findings import Finding, Screening, TagReport, Verdict, counted
-from loopwright.pipeline.historian.cleaning.grid import Grid, resampled
+from loopwright.pipeline.historian.cleaning.findings import Finding, RecordJudgement, Screening, TagReport, counted
 from loopwright.pipeline.historian.cleaning.outliers_and_units import usual
 from loopwright.pipeline.historian.cleaning.record_rows import (
     WINDOWED,
@@ -22,16 +21,17 @@ from loopwright.pipeline.historian.cleaning.record_rows import (
     flag_readings,
     flag_rows,
     interval_text,
+    mask_stuck_and_saturated,
     of_left_out,
     record_of,
     row_codes,
     spans_of,
-    stretches,
 )
-from loopwright.pipeline.historian.cleaning.repeated_blocks import drop_copies
+from loopwright.pipeline.historian.cleaning.repeated_blocks import flag_copies
 from loopwright.pipeline.historian.cleaning.response_consistency import contradict
-from loopwright.pipeline.historian.cleaning.sampling import Sampling, proposed_period, sampling
-from loopwright.pipeline.historian.cleaning.tag_checks import clean, reasons_of, with_texts_of_one_side
+from loopwright.pipeline.historian.cleaning.row_grid import Grid, resampled
+from loopwright.pipeline.historian.cleaning.sampling import TagSampling, proposed_period, sampling
+from loopwright.pipeline.historian.cleaning.tag_checks import flag_bad_readings, reasons_of, with_texts_of_one_side
 from loopwright.pipeline.historian.cleaning.tags import Tag, commanded_range
 from loopwright.pipeline.historian.drift import explained, of_levels, of_quick_models
 from loopwright.pipeline.historian.excitation import SEEN, judged, moves_of, with_rows_out_of_range
@@ -49,8 +49,8 @@ from loopwright.pipeline.historian.notices import (
     on_off,
     with_levels,
 )
-from loopwright.pipeline.historian.old_loops import old_controllers, operated
-from loopwright.pipeline.historian.outlier_review import confirm, pulses
+from loopwright.pipeline.historian.old_loop_fit import old_controllers, operated
+from loopwright.pipeline.historian.outlier_review import remove_pulses, review_outliers
 from loopwright.pipeline.historian.settling import of_period, pace_of
 from loopwright.pipeline.historian.standstill import of_zeros, stops
 from loopwright.pipeline.historian.step_test import with_load_moves
@@ -60,7 +60,7 @@ from loopwright.serving.manifest import Signal
 
 
 # ---------------------------------------------------------------------------------- process variables that no MV moves
-def of_answers(pvs: Sequence[str], verdict: Verdict) -> list[Finding]:
+def findings_of_answers(pvs: Sequence[str], verdict: RecordJudgement) -> list[Finding]:
     """One finding for each PV that answers to no MV, and one where not every PV can be controlled.
 
     Empty where no PV answers at all: then the verdict says what is wrong with the MVs. ``pvs`` are names, in order.
@@ -101,7 +101,7 @@ class Screened:
     local: tzinfo | None = None  # the zone that a person named for the export's dates
 
 
-def screened(
+def screen_export(
     plant: str,
     export: Export,
     tags: Sequence[Tag],
@@ -122,10 +122,10 @@ def screened(
     stopped, stop = stops(own, tags, lambda first_s, end_s: interval_text(first_s, end_s, export))
     flag_readings(own.values(), stopped, Reason.STOP)
     findings += stop
-    findings += drop_copies(own, tags)
+    findings += flag_copies(own, tags)
     for tag in tags:
         if tag.role != "mode":
-            findings += clean(own[tag.tag], tag)
+            findings += flag_bad_readings(own[tag.tag], tag)
         if not own[tag.tag].good.any():
             raise RecordError(f"{tag.tag} has no good reading among {len(own[tag.tag])}: {reasons_of(own[tag.tag])}")
     drawn = [own[t.tag] for t in tags if t.role in {"pv", "dv"}]
@@ -158,15 +158,15 @@ def screened(
     findings += of_left_out(leave_out, flag_rows(grid, [t.tag for t in signals], spans, Reason.LEFT_OUT))
     flag_rows(grid, [t.tag for t in signals], stopped, Reason.STOP)
     findings += of_grid(grid)
-    findings += pulses(grid, own, signals)
+    findings += remove_pulses(grid, own, signals)
     for t in (t for t in tags if t.role == "mv"):
         let_go(t.tag)
-    findings += confirm(grid, own, signals, by_tag)
+    findings += review_outliers(grid, own, signals, by_tag)
     for t in (t for t in tags if t.role == "pv"):
         let_go(t.tag)
-    findings += stretches(grid, signals, by_tag)
+    findings += mask_stuck_and_saturated(grid, signals, by_tag)
     findings += of_zeros(grid, signals)
-    findings += inputs_and_answers(grid, signals)
+    findings += mask_contradictions(grid, signals)
     findings += [f for t in tags if t.role == "mode" for f in of_mode(own[t.tag], grid.value[t.tag])]
     code = row_codes(grid, signals, tags, own, without_modes)
     record = replace(record_of(grid, code, signals), fed_back=pace.fed_back)
@@ -184,7 +184,7 @@ def screened(
     verdict = with_levels(verdict, excerpt, tags)
     verdict = with_rows_out_of_range(verdict, int(counts[Reason.RANGE]), len(code))
     verdict = with_texts_of_one_side(verdict, findings)
-    findings += of_answers([s.name for s in record.pv_signals], verdict)
+    findings += findings_of_answers([s.name for s in record.pv_signals], verdict)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags
     )
@@ -216,7 +216,7 @@ def screened(
     return Screened(record, grid, code, own, report, step, models, export.local)
 
 
-def inputs_and_answers(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
+def mask_contradictions(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
     """Stretches in which PVs and inputs contradict each other are masked, slow motion without the inputs is named."""
     inputs = [t.tag for t in signals if t.role != "pv"]
     u = [grid.known(t) for t in inputs]
@@ -266,7 +266,7 @@ def _gap_s(grid: Grid) -> float:
 
 
 def _tag_report(
-    tag: Tag, series: Series, grid: Grid, record: Record, rate: Sampling, counts: dict[str, int], step: float
+    tag: Tag, series: Series, grid: Grid, record: Record, rate: TagSampling, counts: dict[str, int], step: float
 ) -> TagReport:
     signal = next((s for s in (*record.pv_signals, *record.mv_signals, *record.dv_signals) if s.name == tag.name), None)
     lost = np.bincount(grid.code[tag.tag], minlength=len(Reason))

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.answers import COLOUR, whitening
-from loopwright.pipeline.historian.arx_model import Linear, blocks_of, fitted, least_squares
+from loopwright.pipeline.historian.arx_model import Linear, blocks_of, fit_arx, least_squares
 from loopwright.pipeline.historian.cleaning.findings import Finding
-from loopwright.pipeline.historian.cleaning.grid import resampled
-from loopwright.pipeline.historian.cleaning.record_rows import readings_of, stretches
+from loopwright.pipeline.historian.cleaning.record_rows import mask_stuck_and_saturated, readings_of
+from loopwright.pipeline.historian.cleaning.row_grid import resampled
 from loopwright.pipeline.historian.cleaning.sampling import NICE_S
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.feedback import fed_back
@@ -156,7 +156,7 @@ MOVE = 0.02  # of an MV's span
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class SettlingAnswer:
     """How long a PV takes to settle after a move of an MV; one that goes on as a ramp, to get going and to stop."""
 
     pv: str
@@ -172,13 +172,13 @@ class Pace:
     Only ``answers`` decide anything; ``uncertain`` are those whose settling time another model does not confirm.
     """
 
-    answers: tuple[Answer, ...] = ()
+    answers: tuple[SettlingAnswer, ...] = ()
     hold_s: float = np.inf  # [s] the shortest usual one
-    uncertain: tuple[Answer, ...] = ()
+    uncertain: tuple[SettlingAnswer, ...] = ()
     fed_back: bool = False  # by the readings: rows averaged from them may hide it
 
     @property
-    def slowest(self) -> Answer | None:
+    def slowest(self) -> SettlingAnswer | None:
         """The answer that takes longest; None where none is clear."""
         return max(self.answers, key=lambda a: a.settles_s, default=None)
 
@@ -249,7 +249,7 @@ def in_words(seconds: float) -> str:
 def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) -> Pace:
     """The pace of the plant, by an excerpt of the readings of its signals; ``step_s`` between those of the PVs.
 
-    The linear models of ``fitted`` see the rows as they are and thinned out. From fast rows they learn the noise, and
+    The linear models of ``fit_arx`` see the rows as they are and thinned out. From fast rows they learn the noise, and
     in sparse ones the settling is no more than a row or two; so the sparsest count by which an answer is resolved. No
     answer where the readings give no rows.
     """
@@ -260,7 +260,7 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
     except RecordError:  # of the record's own rows, whose period a person may have given, it is raised again
         return Pace()
     # A sensor that is stuck would answer to nothing, and make the plant seem to settle otherwise in rows thinned out.
-    stretches(grid, [t for t in tags if t.tag in grid.value], {rate.tag: rate for rate in rates})
+    mask_stuck_and_saturated(grid, [t for t in tags if t.tag in grid.value], {rate.tag: rate for rate in rates})
     known = {tag: grid.known(tag) for tag in grid.value}
     names, inputs = [s.tag for s in pv], [s.tag for s in (*mv, *dv)]
     spans = np.array([_span(known[tag]) for tag in inputs])
@@ -273,13 +273,13 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
             break
         thinned[factor] = value, run = _thinned(known, grid.piece, {s.tag for s in mv}, factor, back)
         for name in names:
-            model = fitted(value[name], [value[tag] for tag in inputs], run)
+            model = fit_arx(value[name], [value[tag] for tag in inputs], run)
             if model is not None:
                 for i, answer in _answers(model, spans, len(mv)).items():
                     found.setdefault((name, inputs[i]), []).append((factor, *answer))
     settled = {pair: _settling(rows) for pair, rows in found.items()}
     most = MOST_SHARE * len(grid)
-    answers: dict[bool, list[Answer]] = {True: [], False: []}
+    answers: dict[bool, list[SettlingAnswer]] = {True: [], False: []}
     for (name, moved), (n, shown) in settled.items():
         if 0 < n <= most:
             factor = max((f for f, _, _ in found[name, moved] if n >= RESOLVED * f), default=1)
@@ -287,7 +287,7 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
             z, i, rows = [value[tag] for tag in inputs], inputs.index(moved), max(round(n / factor), 1)
             kind = found[name, moved][-1][1]
             sure = i in certain(value[name], z, run, {i: rows}) if kind else grows(value[name], z, run, i)
-            answers[sure].append(Answer(name, moved, n * step_s, shown))
+            answers[sure].append(SettlingAnswer(name, moved, n * step_s, shown))
     hold = min((_hold(known[s.tag], grid.piece) for s in mv), default=np.inf) * step_s
     return Pace(tuple(answers[True]), hold, tuple(answers[False]), back)
 

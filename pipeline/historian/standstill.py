@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.cleaning.findings import Finding, counted
-from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.outliers_and_units import TEMPERATURES
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
 from loopwright.pipeline.historian.cleaning.tag_checks import CODES, apart_zeros
 from loopwright.pipeline.historian.cleaning.tags import KEEP, Tag
 from loopwright.pipeline.historian.drift import explained

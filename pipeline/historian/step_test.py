@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.arx_model import Linear, free_run
-from loopwright.pipeline.historian.cleaning.findings import InputReport, Verdict
+from loopwright.pipeline.historian.cleaning.findings import InputReport, RecordJudgement
 from loopwright.pipeline.historian.excitation import SEEN
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record
@@ -174,7 +174,7 @@ LEAST_WINDOWS = 3  # of the test's length in the record; else shorter ones
 MOST_OF_PV = 0.5  # of the PV's range, that an answer has at most
 
 
-def with_load_moves(verdict: Verdict, record: Record, models: Mapping[str, Linear | None]) -> Verdict:
+def with_load_moves(verdict: RecordJudgement, record: Record, models: Mapping[str, Linear | None]) -> RecordJudgement:
     """The verdict, its MVs with the move that a step test needs among the loads of the record."""
     if not len(record):
         return verdict

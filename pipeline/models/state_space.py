@@ -16,9 +16,9 @@ from loopwright.pipeline.models.part import Learnt, Part, Source, accuracy, pred
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.models.training.network_parts import LongRun, fit_figures, fit_in_two, trainer_of
 from loopwright.pipeline.models.training.objectives import (
+    JacobianSums,
     Rows,
     Samples,
-    Sums,
     check_finite,
     chunks,
     input_jacobian,
@@ -82,7 +82,7 @@ class StateWindows(Rows):
         start, mv, future = (torch.from_numpy(a) for a in (self.start, self.mv, self.future))
         root = self.future.size**-0.5 / net.y_scale  # (n_pv,)
         n_pv = start.shape[1]
-        sums = Sums(net)
+        sums = JacobianSums(net)
         for rows in chunks(len(self), chunk):
             x, sensitivity = start[rows], None
             for step in range(self.steps):

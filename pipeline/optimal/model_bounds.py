@@ -17,7 +17,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.metric import together
 from loopwright.pipeline.files import digest, read_json, write_json
 from loopwright.pipeline.optimal.bounds import Bounds
-from loopwright.pipeline.optimal.horizon import MOVE_WEIGHT
+from loopwright.pipeline.optimal.nmpc_horizon import MOVE_WEIGHT
 from loopwright.pipeline.plants.identified import IdentifiedPlant, shift_rows
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario

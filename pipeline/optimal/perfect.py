@@ -28,7 +28,7 @@ from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.evaluation.case import Effort
 from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
-from loopwright.pipeline.optimal.horizon import Horizon, Plan
+from loopwright.pipeline.optimal.nmpc_horizon import Horizon, NmpcPlan
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.simulation.scenario import Scenario
@@ -70,7 +70,7 @@ class PerfectNmpc:
         self.failures = 0
         self.age = 0  # samples since the plan was solved
         self.moves: list[Array] = []  # every MV that ``step`` gave
-        self._plan: Plan | None = None
+        self._plan: NmpcPlan | None = None
         self._target: Array | None = None
         self._parameters: Array | None = None
 
@@ -98,7 +98,7 @@ class PerfectNmpc:
         self.moves.append(plan.mv[0])
         return plan.mv[0]
 
-    def _follow(self, x: Array, rest: Plan, p: Array) -> bool:
+    def _follow(self, x: Array, rest: NmpcPlan, p: Array) -> bool:
         """Whether the rest of the last plan still stands: young, and neither state nor parameters surprise it."""
         young = self.age + 1 < self._every and rest.solved
         expected = self._parameters is not None and np.array_equal(self._parameters, p)
@@ -113,7 +113,7 @@ def search(
     simulate: Callable[..., Array],
     reaches: Sequence[int] = DEFAULT.reaches,
     moves: Array | None = None,
-) -> Plan:
+) -> NmpcPlan:
     """The best plan from several rollouts; the best rollout itself where none was solved.
 
     ``moves`` (m, n_mv) are one more start: what another controller did over the first m periods.

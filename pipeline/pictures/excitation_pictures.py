@@ -7,7 +7,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
-from loopwright.pipeline.historian.cleaning.findings import InputReport, Verdict
+from loopwright.pipeline.historian.cleaning.findings import InputReport, RecordJudgement
 from loopwright.pipeline.historian.cleaning.record_rows import evenly
 from loopwright.pipeline.historian.excitation import (
     ALIKE,
@@ -105,7 +105,7 @@ def verdict(found: Screened) -> Canvas:
         return canvas
 
 
-def _rows_title(v: Verdict) -> str:
+def _rows_title(v: RecordJudgement) -> str:
     return f"{v.rows} rows, {v.parameters} parameters\nof a plain linear model"
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure as Canvas
 
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.evaluation.verdicts import Check, Outcome
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome
 from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, Draw, clear_legend, scale
 from loopwright.pipeline.pictures.numbers import number
 
@@ -68,16 +68,16 @@ def free_run_picture(model_set: str, pv: str, unit: str) -> Draw:
 def free_run_fit_at_least(limit: float, model_set: str, kind: str, *pvs: str) -> Check:
     """A check that the kept network's long free run fits to ``limit`` [%] in every named PV, for every data seed."""
 
-    def measure(evidence: Evidence) -> Outcome:
+    def measure(evidence: Evidence) -> CheckOutcome:
         kept = {pv: free_run_figures(evidence, model_set, kind, "free_run_trained", pv) for pv in pvs}
         worst = {pv: min(found["free_run_fit"]) for pv, found in kept.items()}
-        return Outcome(", ".join(f"{pv} {fit:.2f} %" for pv, fit in worst.items()), min(worst.values()) >= limit)
+        return CheckOutcome(", ".join(f"{pv} {fit:.2f} %" for pv, fit in worst.items()), min(worst.values()) >= limit)
 
     what = f"free-run fit of the {NETWORKS[kind][0]} network"
     return Check(what, measure, f"at least {limit:g} % of {' and '.join(pvs)}, whatever the data seed")
 
 
-def one_step_says_little(model_set: str, kind: str, pv: str, unit: str, evidence: Evidence) -> Outcome:
+def one_step_says_little(model_set: str, kind: str, pv: str, unit: str, evidence: Evidence) -> CheckOutcome:
     """Whether of a network's two trainings the one more accurate one step ahead runs free the worse."""
     runs = [free_run_figures(evidence, model_set, kind, trained, pv) for trained in TRAINED]
     near, far = ([statistics.median(run[key]) for run in runs] for key in ("one_step_rmse", "free_run_fit"))
@@ -86,4 +86,4 @@ def one_step_says_little(model_set: str, kind: str, pv: str, unit: str, evidence
         f"free-run fit {far[0]:.1f} %, then {far[1]:.1f} %"
     )
     limit = "trained on free runs: a larger error one step ahead, a smaller one running free (medians)"
-    return Outcome(shown, near[1] > near[0] and far[1] > far[0], limit)
+    return CheckOutcome(shown, near[1] > near[0] and far[1] > far[0], limit)

@@ -185,7 +185,7 @@ SET_POINTS = "set_points.npz"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SetPoints:
+class RecordedSetPoints:
     """Set points (n, n_sp) of PVs in the rows of a record, in their units; NaN where a loop was not in automatic."""
 
     pvs: tuple[str, ...]

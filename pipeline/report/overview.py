@@ -6,14 +6,14 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from loopwright.pipeline.evaluation.leaderboard import LawStanding, Standing, tally
+from loopwright.pipeline.evaluation.leaderboard import CaseStanding, LawStanding, tally
 from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.report.templating import REGISTRY_URL, render, write_pages
 
 Count = tuple[int, int]
 
 
-def write_overview(standings: Sequence[Standing], out: Path) -> list[Path]:
+def write_overview(standings: Sequence[CaseStanding], out: Path) -> list[Path]:
     """Write report.html and report.md into ``out``, the folder of the cases' folders; returns their paths."""
     content = context(standings, out)
     return write_pages(out, {name: render(f"overview.{name.partition('.')[2]}.j2", content) for name in PAGES})
@@ -22,7 +22,7 @@ def write_overview(standings: Sequence[Standing], out: Path) -> list[Path]:
 PAGES = ("report.html", "report.md")
 
 
-def context(standings: Sequence[Standing], out: Path) -> dict[str, Any]:
+def context(standings: Sequence[CaseStanding], out: Path) -> dict[str, Any]:
     """Everything that the templates show."""
     return {
         "cases": [_case(standing, out) for standing in standings],
@@ -41,7 +41,7 @@ def _sum(counts: Iterable[Count]) -> Count:
     return sum(good for good, _ in rows), sum(known for _, known in rows)
 
 
-def _case(standing: Standing, out: Path) -> dict[str, Any]:
+def _case(standing: CaseStanding, out: Path) -> dict[str, Any]:
     picture = standing.folder / "figures" / "closed_loop.png"
     return {
         "of": standing,
@@ -54,7 +54,7 @@ def _case(standing: Standing, out: Path) -> dict[str, Any]:
     }
 
 
-def _law(standing: Standing, law: LawStanding, out: Path) -> dict[str, Any]:
+def _law(standing: CaseStanding, law: LawStanding, out: Path) -> dict[str, Any]:
     picture = standing.folder / "figures" / f"closed_loop_{law.law}.png"
     return {
         "of": law,
@@ -64,13 +64,13 @@ def _law(standing: Standing, law: LawStanding, out: Path) -> dict[str, Any]:
     }
 
 
-def _verdict(standing: Standing) -> str:
+def _verdict(standing: CaseStanding) -> str:
     """The case in a sentence or two: its best law beside the bound, and what tests on models rest on."""
     tested = "" if standing.grounds is None else f" Tested {standing.grounds.words}."
     return _best(standing) + tested
 
 
-def _best(standing: Standing) -> str:
+def _best(standing: CaseStanding) -> str:
     best = standing.best
     if best is None:
         return "No law qualifies as best controller."

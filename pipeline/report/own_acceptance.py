@@ -12,7 +12,7 @@ from loopwright.pipeline.evaluation.metric import NO_UNIT
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
 from loopwright.pipeline.evaluation.poor_laws import worst_cycle
 from loopwright.pipeline.evaluation.proof import known_rows, statements
-from loopwright.pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.validation import CheckedStatement
 from loopwright.pipeline.historian.settling import in_words
 from loopwright.pipeline.historian.step_test import ALONE, HOLDS, LARGEST, MOVES
 from loopwright.pipeline.pictures.drawing import axis_label
@@ -112,7 +112,7 @@ def _words(evidence: Evidence, one: Worse) -> str:
 UNMEASURED = "not measured"
 
 
-def own_acceptance(evidence: Evidence) -> list[Statement]:
+def own_acceptance(evidence: Evidence) -> list[CheckedStatement]:
     """The record proves the model; no law locks up; the best one settles, stays in range, bears noise, beats the PID.
 
     Every limit is a figure of the evidence, or the one by which a lock-up is told; its row says why.
@@ -156,20 +156,20 @@ def step_test_to_run(evidence: Evidence) -> str:
     )
 
 
-def _lock_ups(name: str, evidence: Evidence) -> Statement:
+def _lock_ups(name: str, evidence: Evidence) -> CheckedStatement:
     law = evidence.laws[name]
     where = lock_up_text(law.metrics.locked_up)
-    return Statement(f"{name}, lock-ups over all tests", "0", str(law.lock_ups), law.lock_ups == 0, where)
+    return CheckedStatement(f"{name}, lock-ups over all tests", "0", str(law.lock_ups), law.lock_ups == 0, where)
 
 
-def _settles(evidence: Evidence, law: str) -> Statement:
+def _settles(evidence: Evidence, law: str) -> CheckedStatement:
     """The largest error at the end of a hold, in the test where it is largest."""
     cvs = evidence.case.plant_class.sp_signals
     limit = FAR * (cvs[0].high - cvs[0].low if len(cvs) == 1 else 100.0)  # of several CVs errors are in % of ranges
     found = {name: evidence.figure(law, name, "max_asse") for name in evidence.scenarios if name not in evidence.daily}
     ends = {name: value for name, value in found.items() if value is not None}
     worst = max(ends, key=lambda name: ends[name], default=None)
-    return Statement(
+    return CheckedStatement(
         f"{law}, largest error at the end of a set point or a disturbance, tests without noise",
         f"≤ {_with_unit(evidence, limit)}",
         UNMEASURED if worst is None else f"{_with_unit(evidence, ends[worst])} in test {worst}",
@@ -178,7 +178,7 @@ def _settles(evidence: Evidence, law: str) -> Statement:
     )
 
 
-def _in_range(evidence: Evidence, law: str) -> Statement:
+def _in_range(evidence: Evidence, law: str) -> CheckedStatement:
     """Where each PV went, beside its range."""
     pvs, reached = evidence.case.plant_class.pv_signals, evidence.laws[law].metrics.reached
     known = [(s, *reached[s.name]) for s in pvs if s.name in reached]
@@ -186,7 +186,7 @@ def _in_range(evidence: Evidence, law: str) -> Statement:
     def words(name: str, unit: str, low: float, high: float) -> str:
         return axis_label(f"{name} {number(low, 4)} … {number(high, 4)}", unit)
 
-    return Statement(
+    return CheckedStatement(
         f"{law}, lowest and highest process variable, tests without noise, models gone wrong apart",
         "within " + ", ".join(words(s.name, s.unit, s.low, s.high) for s in pvs),
         ", ".join(words(s.name, s.unit, low, high) for s, low, high in known) or UNMEASURED,
@@ -195,7 +195,7 @@ def _in_range(evidence: Evidence, law: str) -> Statement:
     )
 
 
-def _bears_noise(evidence: Evidence, law: str) -> Statement | None:
+def _bears_noise(evidence: Evidence, law: str) -> CheckedStatement | None:
     """The main test with noise; None where it has none."""
     test = evidence.main_test.removesuffix(NOISE_SUFFIX)
     quiet, noisy = (evidence.figure(law, name) for name in (test, test + NOISE_SUFFIX))
@@ -203,7 +203,7 @@ def _bears_noise(evidence: Evidence, law: str) -> Statement | None:
         return None
     floor = evidence.floor(test)
     limit = quiet + floor
-    return Statement(
+    return CheckedStatement(
         _what(evidence, law, test + NOISE_SUFFIX),
         f"{evidence.case.criterion.short} ≤ {number(quiet)} + {number(floor)} = {_with_unit(evidence, limit)}",
         _with_unit(evidence, noisy),
@@ -212,7 +212,7 @@ def _bears_noise(evidence: Evidence, law: str) -> Statement | None:
     )
 
 
-def _beside(evidence: Evidence, law: str, baseline: str) -> Iterator[Statement]:
+def _beside(evidence: Evidence, law: str, baseline: str) -> Iterator[CheckedStatement]:
     """No worse than the baseline in each test of the gate."""
     for test in (*evidence.case.weights, *evidence.daily):
         own, other, floor = evidence.figure(law, test), evidence.figure(baseline, test), evidence.floor(test)
@@ -221,7 +221,7 @@ def _beside(evidence: Evidence, law: str, baseline: str) -> Iterator[Statement]:
             continue
         pid, least = law_name(baseline), _with_unit(evidence, floor)
         hidden = f"the {pid} has {_with_unit(evidence, other)}; errors that noise can hide, up to {least}, are equal"
-        yield Statement(
+        yield CheckedStatement(
             f"{_what(evidence, law, test)}, beside the {pid}",
             f"{evidence.case.criterion.short} ≤ {_with_unit(evidence, limit)}",
             _with_unit(evidence, own),
@@ -230,12 +230,12 @@ def _beside(evidence: Evidence, law: str, baseline: str) -> Iterator[Statement]:
         )
 
 
-def _score(evidence: Evidence, law: str, baseline: str) -> Statement:
+def _score(evidence: Evidence, law: str, baseline: str) -> CheckedStatement:
     """The gate score beside the baseline's: the errors over the bound's, where there is a bound."""
     own, other = evidence.score(law), evidence.score(baseline)
     known = own is not None and other is not None
     bound = {"nmpc": "the perfect-model NMPC's", "baseline": f"the {law_name(baseline)}'s"}
-    return Statement(
+    return CheckedStatement(
         f"{law}, error over {bound.get(evidence.relative_to, 'what noise can hide')}, all tests by their weights",
         UNMEASURED if other is None else f"≤ {times(other)}, the {law_name(baseline)}'s",
         UNMEASURED if own is None else times(own),

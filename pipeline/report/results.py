@@ -13,7 +13,7 @@ from rich.table import Table
 
 from loopwright.pipeline.config.params import PARAMS_FILE, entries, sections
 from loopwright.pipeline.errors import PipelineError
-from loopwright.pipeline.evaluation.leaderboard import LawStanding, Standing, by_reason, tally, withheld_in
+from loopwright.pipeline.evaluation.leaderboard import CaseStanding, LawStanding, by_reason, tally, withheld_in
 from loopwright.pipeline.evaluation.metric import with_unit
 from loopwright.pipeline.evaluation.validation import FILE, Validation
 from loopwright.pipeline.pictures.numbers import ratio
@@ -39,7 +39,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
             f"{artifacts.absolute()} holds no results; run the pipeline first (loopwright run), or go to the folder in "
             "which it ran"
         )
-    standings = {folder.name: Standing.read(folder) for folder in folders}
+    standings = {folder.name: CaseStanding.read(folder) for folder in folders}
     if case is not None and case not in standings:
         raise PipelineError(f"{artifacts} holds no case {case!r}; it has {', '.join(standings)}")
     if case is not None:  # no title of the table, which would be broken to its width
@@ -106,7 +106,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     console.print("registry   make registry, then /#/models in the browser")
 
 
-def _beside_the_old_loop(standing: Standing) -> str:
+def _beside_the_old_loop(standing: CaseStanding) -> str:
     """By how much the best law is better or worse than the loop that the plant was run by before, test by test."""
     found = [(test, 100 * share) for test, share in standing.over_old_loop.items()]
     parts = [
@@ -117,7 +117,7 @@ def _beside_the_old_loop(standing: Standing) -> str:
     return "; ".join(parts)
 
 
-def _beside_the_best(standing: Standing, shipped: Iterable[LawStanding]) -> list[str]:
+def _beside_the_best(standing: CaseStanding, shipped: Iterable[LawStanding]) -> list[str]:
     """Warnings for a person who takes the best controller: requirements missed, loops that swing."""
     lines = [f"not met: {row.what}" for row in standing.requirements if row.holds is False]
     return [*lines, *(f"{law.law} swings to the end in {law.swings}" for law in shipped if law.swings)]
@@ -136,7 +136,7 @@ def _given(params: Path, case: str) -> tuple[str, ...] | None:
     return entries("controllers", case, "name", params)
 
 
-def overview(standings: Iterable[Standing]) -> Table:
+def overview(standings: Iterable[CaseStanding]) -> Table:
     """One row a law: figure on the test that weighs most, bound, ratio, time of a step, size of the file."""
     table = Table(box=box.SIMPLE, title_justify="left", pad_edge=False)
     table.title = "Each case's main test, median over data seeds; the bound is the perfect-model NMPC"
@@ -152,7 +152,7 @@ def overview(standings: Iterable[Standing]) -> Table:
     return table
 
 
-def _about(standing: Standing) -> list[str]:
+def _about(standing: CaseStanding) -> list[str]:
     """The first column of a case, a line a row."""
     lines = [f"[bold]{standing.case}[/bold]", f"{escape(with_unit(standing.metric, standing.unit))}, {standing.test}"]
     if standing.grounds is not None:
@@ -168,7 +168,7 @@ def _about(standing: Standing) -> list[str]:
     return lines
 
 
-def _row(standing: Standing, law: LawStanding) -> tuple[str, ...]:
+def _row(standing: CaseStanding, law: LawStanding) -> tuple[str, ...]:
     return (
         (f"[bold]{law.law} *[/bold]" if law.best else law.law)
         + (f" [red]!{law.lock_ups}[/red]" if law.lock_ups else ""),
@@ -180,7 +180,7 @@ def _row(standing: Standing, law: LawStanding) -> tuple[str, ...]:
     )
 
 
-def _tests(standing: Standing) -> Table:
+def _tests(standing: CaseStanding) -> Table:
     """The laws of a case in all its tests, a row a test."""
     validation = Validation.read(standing.folder / FILE)
     scenarios, metric, weights = validation.scenarios, validation.metric, validation.gate.weights
@@ -218,7 +218,7 @@ def _ahead(law: LawStanding) -> bool:
     return law.ratio is not None and law.ratio < AHEAD
 
 
-def _multiple(standing: Standing, law: LawStanding) -> str:
+def _multiple(standing: CaseStanding, law: LawStanding) -> str:
     """Two decimals, more within 1 % of the bound; what it is a multiple of, where there is no bound.
 
     ``n`` marks a bound below the error that noise can hide.

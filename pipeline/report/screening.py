@@ -10,7 +10,7 @@ from matplotlib.figure import Figure as Canvas
 
 from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.files import write_text
-from loopwright.pipeline.historian.cleaning.findings import InputReport, Verdict
+from loopwright.pipeline.historian.cleaning.findings import InputReport, RecordJudgement
 from loopwright.pipeline.historian.excitation import HELD
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.screening import Screened
@@ -54,7 +54,7 @@ def _inline(canvas: Canvas) -> str:
 
 
 # ------------------------------------------------------------------------------ lines on the plant by its data
-def sayings(verdict: Verdict, units: Mapping[str, str], known: Collection[Known] = ()) -> list[str]:
+def sayings(verdict: RecordJudgement, units: Mapping[str, str], known: Collection[Known] = ()) -> list[str]:
     """Lines on the plant by its data, one a pair, for a person to compare with what is known of it.
 
     ``units`` are those of the signals by name; of the pairs that are ``known`` nothing is asked.

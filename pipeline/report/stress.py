@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from loopwright.pipeline.evaluation.stress.draws import KINDS, MOST_SPAN, MOST_ZERO, STROKE, STUCK_FOR, Draw
-from loopwright.pipeline.evaluation.stress.loops import Outcome, Stress
+from loopwright.pipeline.evaluation.stress.loops import Stress, StressOutcome
 from loopwright.pipeline.evaluation.stress.summary import QUANTILES, Summary, table
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.pictures.drawing import save
@@ -95,7 +95,7 @@ def write_stress(run: StressRun, out: Path) -> list[Path]:
     return [*pages, out / TABLE, *written]  # fmt: skip
 
 
-def _loop_row(run: StressRun, draw: Draw, outcome: Outcome, relative: float) -> dict[str, Any]:
+def _loop_row(run: StressRun, draw: Draw, outcome: StressOutcome, relative: float) -> dict[str, Any]:
     case = run.summary.case
     return {
         "index": draw.index,
@@ -108,7 +108,7 @@ def _loop_row(run: StressRun, draw: Draw, outcome: Outcome, relative: float) -> 
     }
 
 
-def failed_words(outcome: Outcome) -> str:
+def failed_words(outcome: StressOutcome) -> str:
     """How a loop failed; empty where it did not."""
     words = {
         "locked up": outcome.locked_up,

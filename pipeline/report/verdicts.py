@@ -9,11 +9,11 @@ from loopwright.pipeline.evaluation.case import Curve, PaperFigure, PaperTable, 
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import LawEvidence, Row
 from loopwright.pipeline.evaluation.validation import (
+    CheckedStatement,
     GateRecord,
     GateResult,
     LawResult,
     PaperResult,
-    Statement,
     Titles,
     Validation,
 )
@@ -53,8 +53,8 @@ class Judged:
     """A case compared with its paper: the paper's tables, the requirements, and the paper's statements."""
 
     tables: tuple[tuple[PaperTable, tuple[TableRow, ...]], ...]
-    acceptance: tuple[Statement, ...]
-    statements: tuple[Statement, ...]
+    acceptance: tuple[CheckedStatement, ...]
+    statements: tuple[CheckedStatement, ...]
 
 
 def judge(evidence: Evidence, claims: Claims) -> Judged:
@@ -83,7 +83,7 @@ def table_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> TableRow:
     return TableRow(row.label, metric, row.paper, ours, low, high, verdict, holds, digits)
 
 
-def acceptance(evidence: Evidence, claims: Claims) -> list[Statement]:
+def acceptance(evidence: Evidence, claims: Claims) -> list[CheckedStatement]:
     """The whole acceptance list: the case's requirements, the common ones, and the case's own checks.
 
     The common ones of an own plant are ``own_acceptance``.
@@ -92,13 +92,13 @@ def acceptance(evidence: Evidence, claims: Claims) -> list[Statement]:
     seeds = 1 if evidence.own_data else evidence.case.data_seeds  # a user's data are one record
     locked = ", ".join(f"{name} {law.lock_ups}" for name, law in evidence.laws.items())
     common = [
-        Statement(
+        CheckedStatement(
             "best controller, data seeds",
             f"≥ {seeds}",
             "every law locks up" if best is None else str(best.seeds),
             best is not None and best.seeds >= seeds,
         ),
-        Statement(
+        CheckedStatement(
             "best controller, lock-ups over all seeds and scenarios",
             "0",
             "every law locks up" if best is None else str(best.lock_ups),
@@ -112,7 +112,7 @@ def acceptance(evidence: Evidence, claims: Claims) -> list[Statement]:
     return [*rows, *common, *(check.statement(evidence) for check in claims.acceptance)]
 
 
-def requirement(need: Requirement, evidence: Evidence) -> Statement:
+def requirement(need: Requirement, evidence: Evidence) -> CheckedStatement:
     """One row of the acceptance list; the limit of a ratio is its factor times the bound's figure.
 
     Without a measured figure or without the bound, ``holds`` is None.
@@ -140,7 +140,7 @@ def requirement(need: Requirement, evidence: Evidence) -> Statement:
         measured, holds = f"{number(value, 4)}{unit}", need.low <= value <= high
         if need.times is not None and high:
             measured += f" ({value / high * need.high:.3f} ×)"
-    return Statement(what, limit, measured, holds)
+    return CheckedStatement(what, limit, measured, holds)
 
 
 DEFAULT = "mae"  # the metric that the digests of gates leave out

@@ -21,7 +21,7 @@ MAX_SAMPLES = 10_000_000  # of a simulation
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class TimedValue:
     """A value at a time [s]; ``name`` may be empty for a plant's only set point."""
 
     value: float
@@ -58,7 +58,7 @@ class Timetable:
         return next((s for s in self.manual if s.start_s <= time_s < s.end_s), None)
 
 
-def parse_event(text: str, form: str) -> Event:
+def parse_event(text: str, form: str) -> TimedValue:
     """An event with a name where the form has ``=``, and with a time where it allows ``@``; ParamsError shows it.
 
     A form that begins with ``[`` leaves the name to the writer.
@@ -68,7 +68,7 @@ def parse_event(text: str, form: str) -> Event:
     value, at, time_s = rest.partition("@")
     if not equals or (named and not name) or (at and "@" not in form):
         raise ParamsError(f"{text!r} is not of the form {form}")
-    event = Event(_number(value, text, form), _number(time_s, text, form) if at else 0.0, name)
+    event = TimedValue(_number(value, text, form), _number(time_s, text, form) if at else 0.0, name)
     if event.time_s < 0:
         raise ParamsError(f"{text!r}: the time must not be negative")
     return event
@@ -91,9 +91,9 @@ def timetable(
     plant: Simulator,
     test: Scenario | None = None,
     *,
-    set_points: Sequence[Event] = (),
-    disturbances: Sequence[Event] = (),
-    noise: Sequence[Event] = (),
+    set_points: Sequence[TimedValue] = (),
+    disturbances: Sequence[TimedValue] = (),
+    noise: Sequence[TimedValue] = (),
     manual: Sequence[ManualSpan] = (),
     start_cv: float | None = None,
     duration_s: float | None = None,
@@ -162,7 +162,7 @@ def timetable(
     return Timetable(plant, sp, x0, mv0, changes, *_noise(plant, noise, n, seed), tuple(manual), marks, measured)
 
 
-def _set_point(plant: Simulator, event: Event) -> int:
+def _set_point(plant: Simulator, event: TimedValue) -> int:
     """The plant's set point that an event moves; ParamsError where it names none of them, or has to name one."""
     names = [s.name for s in plant.sp_signals]
     if not event.name and len(names) > 1:
@@ -225,7 +225,7 @@ def _samples(plant: Simulator, duration_s: float | None, default: int) -> int:
     return n
 
 
-def _sample(plant: Simulator, event: Event, n: int) -> int:
+def _sample(plant: Simulator, event: TimedValue, n: int) -> int:
     k = round(event.time_s / plant.period_s)
     if k >= n:
         raise ParamsError(f"time {event.time_s:g} s lies beyond the run, which ends at {n * plant.period_s:g} s")
@@ -237,7 +237,7 @@ def _stretched(values: Array, n: int) -> Array:
     return np.concatenate([values[:n], np.repeat(values[-1:], max(0, n - len(values)), axis=0)])
 
 
-def _noise(plant: Simulator, deviations: Sequence[Event], n: int, seed: int) -> tuple[Array, Array]:
+def _noise(plant: Simulator, deviations: Sequence[TimedValue], n: int, seed: int) -> tuple[Array, Array]:
     """Measurement noise (n, n_pv) and (n, n_dv), from the standard deviations of some PVs and measured disturbances."""
     std = {s.name: 0.0 for s in (*plant.pv_signals, *plant.dv_signals)}
     for event in deviations:

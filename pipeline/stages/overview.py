@@ -8,7 +8,7 @@ from pathlib import Path
 
 from loopwright.pipeline.config.params import sections
 from loopwright.pipeline.engine.command import run_stage
-from loopwright.pipeline.evaluation.leaderboard import Standing
+from loopwright.pipeline.evaluation.leaderboard import CaseStanding
 from loopwright.pipeline.evaluation.validation import FILE
 from loopwright.pipeline.report.overview import PAGES, write_overview
 from loopwright.pipeline.stages.paths import ARTIFACTS
@@ -29,7 +29,7 @@ def brought_up() -> bool:
 
 
 def _written(cases: Iterable[str]) -> list[Path]:
-    return write_overview([Standing.read(ARTIFACTS / case) for case in cases], ARTIFACTS)
+    return write_overview([CaseStanding.read(ARTIFACTS / case) for case in cases], ARTIFACTS)
 
 
 if __name__ == "__main__":

@@ -17,12 +17,12 @@ from loopwright.pipeline.historian.export_params import (
     check_agreement,
     check_period,
     limits_of,
-    screened_export,
+    read_and_screen,
     signal_tags,
     with_units,
     within_stated,
 )
-from loopwright.pipeline.historian.old_loops import set_points
+from loopwright.pipeline.historian.old_loop_fit import set_points
 from loopwright.pipeline.historian.screening import refusal
 from loopwright.pipeline.report.screening import write_page
 
@@ -38,11 +38,11 @@ def screen(name: str) -> None:
     check_agreement(params, plant, tags)
     tags = with_units(tags, params)
     check_agreement(params, plant, tags)
-    found = screened_export(params, tags)
+    found = read_and_screen(params, tags)
     check_period(params, plant, found.record.period_s)
     stated = within_stated(plant, tags, found.record)
     if stated != tags:  # readings go beyond the plant's ranges: they are left out, and counted
-        found = screened_export(params, stated)
+        found = read_and_screen(params, stated)
     refused = refusal(found, tags, params.anyway)
     if refused:
         helps = [f"`loopwright new {name}` with --replace writes the step test to run"] * refused.step_test

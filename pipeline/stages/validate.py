@@ -22,8 +22,8 @@ from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.extrapolation import grounds_of, widest
 from loopwright.pipeline.evaluation.law_evidence import (
     BASE,
-    Analysis,
     Form,
+    FormAnalysis,
     LawEvidence,
     LawMetrics,
     OverSeeds,
@@ -197,7 +197,7 @@ def _metrics(
 
     def form(name: str, settings: Mapping[str, Any]) -> Form:
         rows = [t for t in trials if t.form == name]
-        analysis = parse(Analysis, analyses[name], f"analysis of {name}") if analyses.get(name) else None
+        analysis = parse(FormAnalysis, analyses[name], f"analysis of {name}") if analyses.get(name) else None
         tests = {test: _over_seeds({t.seed: t.metrics[test] for t in rows}) for test in rows[0].metrics}
         return Form(settings, rows[0].info, tests, analysis)
 

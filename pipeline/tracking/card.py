@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from html import escape
 
-from loopwright.pipeline.evaluation.law_evidence import Analysis
+from loopwright.pipeline.evaluation.law_evidence import FormAnalysis
 from loopwright.pipeline.evaluation.leaderboard import because
 from loopwright.pipeline.evaluation.metric import ratio_to_bound, with_unit
 from loopwright.pipeline.evaluation.validation import Validation
@@ -140,9 +140,9 @@ def analysis_figures(validation: Validation | None, law: str) -> dict[str, float
     return {} if validation is None else dict(_analysed(validation, law).figures)
 
 
-def _analysed(validation: Validation, law: str) -> Analysis:
+def _analysed(validation: Validation, law: str) -> FormAnalysis:
     result = validation.laws.get(law)
-    return (result.analysis.get("base") if result else None) or Analysis()
+    return (result.analysis.get("base") if result else None) or FormAnalysis()
 
 
 def _analysis(validation: Validation, law: str) -> str:

@@ -15,7 +15,7 @@ from loopwright.pipeline.evaluation.law_evidence import BASE, LawMetrics
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 from loopwright.pipeline.tracking.gate import Gate
-from loopwright.pipeline.tracking.stage_results import StageResult, Times, flat
+from loopwright.pipeline.tracking.stage_results import StageResult, StageTimes, flat
 
 MOST = 12  # figures of a run: more would hide those that decide
 OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")
@@ -192,7 +192,7 @@ def _bound(validation: Validation) -> str:
     return f"a loop whose error is what noise can hide, and 1 is as good as that; {tested}"
 
 
-def run_note(result: StageResult, case: str, validation: Validation | None, times: Times) -> str:
+def run_note(result: StageResult, case: str, validation: Validation | None, times: StageTimes) -> str:
     """The description of a run: what the stage did, what came out, and what its metrics mean."""
     item = result.item
     words = {"case": case, "item": item, "metric": "<metric>", "bound": BOUND[False], "one": "the bound"}

@@ -22,7 +22,7 @@ from loopwright.pipeline.files import sha256
 from loopwright.pipeline.tracking.notes import curves, experiment_note, headline, of_gate, run_note, table
 from loopwright.pipeline.tracking.registry import describe, elect_champion, register, withdraw
 from loopwright.pipeline.tracking.signing import Signer
-from loopwright.pipeline.tracking.stage_results import StageResult, Times, dataset_hash, datasets, read_lock
+from loopwright.pipeline.tracking.stage_results import StageResult, StageTimes, dataset_hash, datasets, read_lock
 from loopwright.pipeline.tracking.store import experiment_id, hide_default, store
 
 KEY_TAG = "stage_key"
@@ -76,7 +76,7 @@ def write_run(
 
     Start and end are the stage's. ``records`` are the data that it descends from: path -> content hash.
     """
-    times = Times.of(result, root)
+    times = StageTimes.of(result, root)
     files = list(result.files(root))
     trees = {path.name: _read(path) for path, folder in files if not folder and path.name in FIGURES}
     rows = table(trees)

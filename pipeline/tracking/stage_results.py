@@ -89,7 +89,7 @@ class StageResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Times:
+class StageTimes:
     """Start and end of a stage in ms since 1970; where the duration is not known, both are when the files came.
 
     A receipt belongs to the files on disk only if they were written while that run lasted; files that DVC took
@@ -101,7 +101,7 @@ class Times:
     measured: bool
 
     @classmethod
-    def of(cls, result: StageResult, root: Path) -> Times:
+    def of(cls, result: StageResult, root: Path) -> StageTimes:
         """The times of the run that wrote the files of ``result``."""
         written = max((file.stat().st_mtime for file, _ in result.files(root)), default=0.0)
         try:

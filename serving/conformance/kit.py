@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.conformance.scans import Scanned, scanned, start
-from loopwright.serving.conformance.steps import Answer, answered
+from loopwright.serving.conformance.steps import StepResult, answered
 from loopwright.serving.controller import Controller, runtime_version
 from loopwright.serving.controller_file import sidecar
 from loopwright.serving.errors import ContractError, LoopwrightError
@@ -121,7 +121,7 @@ def vectors_of(controller: Controller) -> dict[str, Any]:
     }
 
 
-def _scale(controller: Controller, answers: list[Answer]) -> dict[str, list[str]]:
+def _scale(controller: Controller, answers: list[StepResult]) -> dict[str, list[str]]:
     """By what each entry's difference is divided: an MV's range, else the entry's largest magnitude in the vectors."""
     taken = [answer.step for answer in answers if answer.step is not None]
     scale = {"mv": written(s.high - s.low for s in controller.manifest.mv)}
@@ -131,7 +131,7 @@ def _scale(controller: Controller, answers: list[Answer]) -> dict[str, list[str]
     return scale
 
 
-def _step_row(inputs: tuple[str, ...], answer: Answer) -> dict[str, Any]:
+def _step_row(inputs: tuple[str, ...], answer: StepResult) -> dict[str, Any]:
     given = answer.given
     row: dict[str, Any] = {"part": given.part, "cold": given.cold}
     row["given"] = {name: written(given.inputs[name]) for name in inputs if name != "state"}
@@ -172,7 +172,7 @@ SHOWN = 5  # mistakes named one by one
 
 
 @dataclass(slots=True)
-class Verdict:
+class KitVerdict:
     """Result of the comparison.
 
     ``largest`` is the largest difference, a share of the entry's scale, and ``where`` its place. ``same_bits`` counts
@@ -226,7 +226,7 @@ class Verdict:
         return ours.tobytes() == theirs.tobytes()
 
 
-def check(folder: Path, answers: Path, sha256: str) -> Verdict:
+def check(folder: Path, answers: Path, sha256: str) -> KitVerdict:
     """Compare a host's ``answers`` with the kit in ``folder``, which is of the controller file with this ``sha256``.
 
     Raises LoopwrightError if either cannot be read, or the answers are those of another controller.
@@ -241,7 +241,7 @@ def check(folder: Path, answers: Path, sha256: str) -> Verdict:
         if found != sha256:
             raise LoopwrightError(f"{path} is for the controller with the SHA-256 {found}; this file's is {sha256}")
     tolerance = float.fromhex(kit["tolerance"])
-    verdict = Verdict(str(theirs.get("host", "a host")), str(theirs.get("onnxruntime", "unknown")), tolerance)
+    verdict = KitVerdict(str(theirs.get("host", "a host")), str(theirs.get("onnxruntime", "unknown")), tolerance)
     if kit["kit"] in UNSHOWN:
         verdict.note = (
             f"the kit has the version {kit['kit']}: it does not show that the host {UNSHOWN[kit['kit']]}; "
@@ -255,7 +255,7 @@ def check(folder: Path, answers: Path, sha256: str) -> Verdict:
     return verdict
 
 
-def _pairs(kit: Mapping[str, Any], theirs: Mapping[str, Any], name: str, verdict: Verdict) -> list[tuple[Any, Any]]:
+def _pairs(kit: Mapping[str, Any], theirs: Mapping[str, Any], name: str, verdict: KitVerdict) -> list[tuple[Any, Any]]:
     rows, answers = kit[name], theirs.get(name)
     if not isinstance(answers, list) or not all(isinstance(answer, dict) for answer in answers):
         raise ContractError(f"the answers have no list of objects {name!r}")
@@ -264,7 +264,7 @@ def _pairs(kit: Mapping[str, Any], theirs: Mapping[str, Any], name: str, verdict
     return list(zip(rows, answers, strict=False))
 
 
-def _check_step(v: Verdict, where: str, row: Mapping[str, Any], answer: Mapping[str, Any], scale: Any) -> None:
+def _check_step(v: KitVerdict, where: str, row: Mapping[str, Any], answer: Mapping[str, Any], scale: Any) -> None:
     wanted, refused = row.get("refused", ""), answer.get("refused", "")
     if wanted or refused:
         if wanted != refused:
@@ -280,7 +280,7 @@ def _check_step(v: Verdict, where: str, row: Mapping[str, Any], answer: Mapping[
     v.same_bits += all(same)
 
 
-def _check_scan(v: Verdict, where: str, row: Mapping[str, Any], answer: Mapping[str, Any], scale: Array) -> None:
+def _check_scan(v: KitVerdict, where: str, row: Mapping[str, Any], answer: Mapping[str, Any], scale: Array) -> None:
     for name in ("mode", "fault"):
         if answer.get(name) != row[name]:
             v.mistakes.append(f"{where}: {name} is {answer.get(name)!r}, but must be {row[name]!r}")

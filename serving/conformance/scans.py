@@ -24,7 +24,7 @@ SURE = 0.4  # share of a margin by which a value lies inside or outside it
 
 
 @dataclass(frozen=True, slots=True)
-class Scan:
+class KitScan:
     """Events before and at one scan. ``sample`` None: the plant cannot be read.
 
     ``set_mode`` is what the operator sets before it, ``missed`` the periods that passed without a scan before it.
@@ -39,7 +39,7 @@ class Scan:
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class ScanStart:
     """How the loop of the scans starts: in AUTO, at set points (n_sp,). Nobody tells where the MV stands."""
 
     sp: Array
@@ -51,7 +51,7 @@ class Start:
 class Scanned:
     """A scan with the command that this runtime gives."""
 
-    scan: Scan
+    scan: KitScan
     command: Command
 
 
@@ -71,9 +71,9 @@ class _Course:
         return np.array(at, dtype=np.float64)
 
 
-def start(manifest: Manifest) -> Start:
+def start(manifest: Manifest) -> ScanStart:
     """The loop of the scans at its start: the set points in the middle of their ranges."""
-    return Start(np.array([s.middle for s in manifest.sp], dtype=np.float64))
+    return ScanStart(np.array([s.middle for s in manifest.sp], dtype=np.float64))
 
 
 def actuators(manifest: Manifest) -> Array:
@@ -112,55 +112,55 @@ def scanned(controller: Controller) -> list[Scanned]:
             return done
 
 
-def _scans(m: Manifest, good: Sample) -> Generator[Scan, Sample, None]:
+def _scans(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
     """Each scan; ``send`` takes a good sample for the next one."""
 
-    def some(n: int, what: str = "good") -> Generator[Scan, Sample, None]:
+    def some(n: int, what: str = "good") -> Generator[KitScan, Sample, None]:
         nonlocal good
         for _ in range(n):
-            good = yield Scan(what, good)
+            good = yield KitScan(what, good)
 
     recovery = RECOVER_AFTER + 1
-    good = yield Scan("the plant cannot be read at first", None)
-    good = yield Scan("a PV at first not finite", _with(good, "pv", 0, nan))
-    good = yield Scan("an applied MV at first not finite", _with(good, "mv_applied", 0, nan))
-    good = yield Scan("no read-back at first", replace(good, mv_applied=None))
+    good = yield KitScan("the plant cannot be read at first", None)
+    good = yield KitScan("a PV at first not finite", _with(good, "pv", 0, nan))
+    good = yield KitScan("an applied MV at first not finite", _with(good, "mv_applied", 0, nan))
+    good = yield KitScan("no read-back at first", replace(good, mv_applied=None))
     yield from some(1, "the first good sample")
-    good = yield Scan("the plant cannot be read after the first good sample", None)
+    good = yield KitScan("the plant cannot be read after the first good sample", None)
     yield from some(RECOVER_AFTER - 1, "before the first command of the law")
     yield from some(5)
     for what, spoilt in _doubtful(m):
-        good = yield Scan(what, spoilt(good))
+        good = yield KitScan(what, spoilt(good))
         yield from some(recovery, f"after: {what}")
-    good = yield Scan("the plant cannot be read", None)
+    good = yield KitScan("the plant cannot be read", None)
     yield from some(recovery, "after the plant could not be read")
     for missed in (1, MAX_GAP, MAX_GAP + 1):
-        good = yield Scan(f"{missed} periods missed", good, missed=missed)
+        good = yield KitScan(f"{missed} periods missed", good, missed=missed)
         yield from some(2)
-    good = yield Scan("by hand", good, set_mode=Mode.MANUAL)
+    good = yield KitScan("by hand", good, set_mode=Mode.MANUAL)
     yield from some(2, "by hand")
-    good = yield Scan("a fault by hand", _with(good, "pv", 0, nan))
+    good = yield KitScan("a fault by hand", _with(good, "pv", 0, nan))
     yield from some(2, "by hand")
-    good = yield Scan("back to AUTO", good, set_mode=Mode.AUTO)
+    good = yield KitScan("back to AUTO", good, set_mode=Mode.AUTO)
     yield from some(3)
-    good = yield Scan("two faults in a row", None)
-    good = yield Scan("two faults in a row", None)
-    good = yield Scan("a good sample between faults", good)
-    good = yield Scan("a fault while it recovers", None)
+    good = yield KitScan("two faults in a row", None)
+    good = yield KitScan("two faults in a row", None)
+    good = yield KitScan("a good sample between faults", good)
+    good = yield KitScan("a fault while it recovers", None)
     yield from some(recovery + 2, "after a fault while it recovers")
-    good = yield Scan("a command did not arrive, and the MV was moved", _moved(m, good), unwritten=True)
+    good = yield KitScan("a command did not arrive, and the MV was moved", _moved(m, good), unwritten=True)
     yield from some(recovery, "after an MV that was moved")
     no_pv = _with(_moved(m, good), "pv", 0, nan)
-    good = yield Scan("a command did not arrive, the MV was moved, and a PV is not finite", no_pv, unwritten=True)
+    good = yield KitScan("a command did not arrive, the MV was moved, and a PV is not finite", no_pv, unwritten=True)
     yield from some(recovery, "after an MV that was moved")
-    good = yield Scan(
+    good = yield KitScan(
         "a command did not arrive, and there is no read-back", replace(good, mv_applied=None), unwritten=True
     )
     yield from some(recovery, "after a command that did not arrive")
-    good = yield Scan("by hand again", good, set_mode=Mode.MANUAL)
-    good = yield Scan("by hand a command did not arrive, and the MV was moved", _moved(m, good), unwritten=True)
+    good = yield KitScan("by hand again", good, set_mode=Mode.MANUAL)
+    good = yield KitScan("by hand a command did not arrive, and the MV was moved", _moved(m, good), unwritten=True)
     yield from some(2, "by hand again")
-    good = yield Scan("back to AUTO", good, set_mode=Mode.AUTO)
+    good = yield KitScan("back to AUTO", good, set_mode=Mode.AUTO)
     yield from some(2, "the last samples")
 
 

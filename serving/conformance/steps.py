@@ -23,7 +23,7 @@ AT_AN_END = 0.1  # share of the values drawn anywhere that lie at an end of the 
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class StepInputs:
     """The inputs of one step without the state. ``cold``: it starts from a state of zeros, else from the last one."""
 
     part: str
@@ -32,15 +32,15 @@ class Given:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class StepResult:
     """The result of one step; where it is refused, ``refused`` says because of the input or of the output."""
 
-    given: Given
+    given: StepInputs
     step: Step | None
     refused: str = ""
 
 
-def answered(controller: Controller) -> list[Answer]:
+def answered(controller: Controller) -> list[StepResult]:
     """All steps of the kit, as this runtime answers them; a refused step leaves the state as it was.
 
     A law that amplifies rounding starts from zeros again long before two right hosts part.
@@ -68,14 +68,14 @@ def answered(controller: Controller) -> list[Answer]:
             return answers
 
 
-def _answer(controller: Controller, given: Given, state: Array) -> Answer:
+def _answer(controller: Controller, given: StepInputs, state: Array) -> StepResult:
     try:
         step = controller.step(**given.inputs, state=controller.cold_state() if given.cold else state)
     except SampleError:
-        return Answer(given, None, "input")
+        return StepResult(given, None, "input")
     except OutputError:
-        return Answer(given, None, "output")
-    return Answer(given, step)
+        return StepResult(given, None, "output")
+    return StepResult(given, step)
 
 
 def _inside(signals: tuple[Signal, ...], mv: Array) -> bool:
@@ -83,7 +83,7 @@ def _inside(signals: tuple[Signal, ...], mv: Array) -> bool:
     return all(s.values is not None or s.low < value < s.high for s, value in zip(signals, mv.tolist(), strict=True))
 
 
-def _drawn(m: Manifest) -> Generator[list[Given], tuple[Given, Array], None]:
+def _drawn(m: Manifest) -> Generator[list[StepInputs], tuple[StepInputs, Array], None]:
     """Choices of inputs for each step: the first with an MV inside its range is taken, or the last.
 
     ``send`` takes what was taken and the last MV (n_mv,), which is the applied one of most steps.
@@ -99,32 +99,32 @@ def _drawn(m: Manifest) -> Generator[list[Given], tuple[Given, Array], None]:
 
     last = _middle(m.mv)
     for k in range(60):
-        _, last = yield [Given("anywhere", anywhere() | ({"mv_applied": last} if k % 3 else {}), cold=k == 0)]
+        _, last = yield [StepInputs("anywhere", anywhere() | ({"mv_applied": last} if k % 3 else {}), cold=k == 0)]
     for _ in range(60):
-        taken, last = yield [Given("inside", anywhere() | {"mv_applied": last}) for _ in range(DRAWS)]
+        taken, last = yield [StepInputs("inside", anywhere() | {"mv_applied": last}) for _ in range(DRAWS)]
     course = taken.inputs
     for k in range(80):
         course = moved(course) | {"sp": course["sp"]}
         if k % 20 == 19:
             course["sp"] = _anywhere(rng, m.sp)
-        _, last = yield [Given("course", course | {"mv_applied": last})]
+        _, last = yield [StepInputs("course", course | {"mv_applied": last})]
     low, high = ({name: _ends(of)[end] for name, of in signals.items()} for end in (0, 1))
     for k in range(50):
         one, other = (low, high) if k < 25 else (high, low)
-        _, last = yield [Given("saturation", {**low, "sp": one["sp"], "pv": other["pv"], "mv_applied": last})]
+        _, last = yield [StepInputs("saturation", {**low, "sp": one["sp"], "pv": other["pv"], "mv_applied": last})]
     stuck = _anywhere(rng, m.mv)
     for _ in range(50):
         course = moved(course)
-        _, last = yield [Given("stuck actuator", course | {"mv_applied": stuck})]
+        _, last = yield [StepInputs("stuck actuator", course | {"mv_applied": stuck})]
     for k in range(3 * COLD_STARTS):
-        _, last = yield [Given("cold start", anywhere(), cold=k % 3 == 0) for _ in range(DRAWS)]
+        _, last = yield [StepInputs("cold start", anywhere(), cold=k % 3 == 0) for _ in range(DRAWS)]
     for name in (n for n in m.inputs if n != "state"):
         for i in range(len(signals[name])):
             for bad in (nan, inf, -inf):
                 spoilt = course[name].copy()
                 spoilt[i] = bad
-                yield [Given("not finite", course | {name: spoilt})]
-                _, last = yield [Given("after a refusal", course | {"mv_applied": last})]
+                yield [StepInputs("not finite", course | {name: spoilt})]
+                _, last = yield [StepInputs("after a refusal", course | {"mv_applied": last})]
 
 
 def _anywhere(rng: np.random.Generator, signals: tuple[Signal, ...]) -> Array:

@@ -13,7 +13,7 @@ from typing import Any
 
 from loopwright.serving.errors import ArtifactError
 from loopwright.serving.graph.onnx_bytes import Message, read_model
-from loopwright.serving.graph.work import BOOL, DOUBLE, ITEM_BYTES, MAX_WORK, RULES, Node, Value, results
+from loopwright.serving.graph.work import BOOL, DOUBLE, ITEM_BYTES, MAX_WORK, RULES, Node, TensorValue, results
 
 MAX_BYTES = 64 * 2**20  # of a controller's file
 # onnxruntime simplifies a graph in a time that grows with the square of its operators: seconds for so many. The largest
@@ -93,13 +93,13 @@ def _metadata(model: Message) -> dict[str, str]:
     return metadata
 
 
-def graph_values(graph: Message) -> tuple[dict[str, Value], int]:
+def graph_values(graph: Message) -> tuple[dict[str, TensorValue], int]:
     """Every value of the graph, by its name, and the work of a step in multiply-adds.
 
     Raises ArtifactError where an operator is off the list, a value's shape cannot be known, or the
     work exceeds MAX_WORK.
     """
-    values: dict[str, Value] = {}
+    values: dict[str, TensorValue] = {}
     for tensor in graph.get("initializer", []):
         _define(values, tensor.get("name", ""), _constant(tensor))
     for given in graph.get("input", []):
@@ -133,13 +133,13 @@ def graph_values(graph: Message) -> tuple[dict[str, Value], int]:
     return values, work
 
 
-def _define(values: dict[str, Value], name: str, value: Value) -> None:
+def _define(values: dict[str, TensorValue], name: str, value: TensorValue) -> None:
     if not name or name in values:
         raise ArtifactError(f"the graph gives the value {name!r} twice" if name else "a value has no name")
     values[name] = value
 
 
-def _constant(tensor: Message) -> Value:
+def _constant(tensor: Message) -> TensorValue:
     """An initializer as a value; its bytes must be as many as its shape asks."""
     name = tensor.get("name", "")
     if "external_data" in tensor or "data_location" in tensor:
@@ -151,16 +151,16 @@ def _constant(tensor: Message) -> Value:
         raise ArtifactError(f"tensor {name!r} has the shape {shape} and {len(raw)} bytes, which do not fit together")
     if dtype == BOOL and raw.strip(b"\0\1"):
         raise ArtifactError(f"tensor {name!r} holds truth values other than 0 and 1")
-    return Value(shape, dtype, raw)
+    return TensorValue(shape, dtype, raw)
 
 
-def _end(row: Message) -> Value:
+def _end(row: Message) -> TensorValue:
     """An input or an output of the graph as a value: its lengths must be numbers."""
     tensor = row.get("type", {}).get("tensor_type", {})
     dims = [d.get("dim_value", -1) for d in tensor.get("shape", {}).get("dim", [])]
     if "shape" not in tensor or any(not 0 <= n <= MAX_WORK for n in dims):
         raise ArtifactError(f"{row.get('name', '')!r} has no fixed shape of lengths up to {MAX_WORK}")
-    return Value(tuple(dims), tensor.get("elem_type", DOUBLE))
+    return TensorValue(tuple(dims), tensor.get("elem_type", DOUBLE))
 
 
 def _operator(row: Message) -> tuple[str, dict[str, Any]]:

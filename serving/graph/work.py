@@ -31,7 +31,7 @@ MOVED_WORK = 4  # of an element that is only copied: 1 to 2 ns, whatever its val
 
 
 @dataclass(frozen=True, slots=True)
-class Value:
+class TensorValue:
     """A tensor's shape and element type, and the bytes of a constant."""
 
     shape: Shape
@@ -57,23 +57,23 @@ class Node:
     """An operator: its inputs (None: left out), its attributes, the number of its outputs."""
 
     op: str
-    inputs: tuple[Value | None, ...]
+    inputs: tuple[TensorValue | None, ...]
     attributes: Mapping[str, object]
     n_out: int
 
     @property
-    def present(self) -> list[Value]:
+    def present(self) -> list[TensorValue]:
         """The inputs that are not left out."""
         return [v for v in self.inputs if v is not None]
 
-    def input(self, i: int) -> Value:
+    def input(self, i: int) -> TensorValue:
         """Input ``i``; ValueError if it is missing."""
         value = self.optional(i)
         if value is None:
             raise ValueError(f"input {i} is missing")
         return value
 
-    def optional(self, i: int) -> Value | None:
+    def optional(self, i: int) -> TensorValue | None:
         """Input ``i``, or None where it is left out."""
         return self.inputs[i] if i < len(self.inputs) else None
 
@@ -85,7 +85,7 @@ class Node:
         return value
 
 
-def results(node: Node) -> tuple[list[Value], int]:
+def results(node: Node) -> tuple[list[TensorValue], int]:
     """The shapes and types of an operator's outputs, and its work in multiply-adds.
 
     Raises ValueError where the rules of ONNX do not allow the inputs or the attributes.
@@ -98,7 +98,7 @@ def results(node: Node) -> tuple[list[Value], int]:
     if len(shapes) != node.n_out:
         raise ValueError(f"it has {node.n_out} outputs; it must have {len(shapes)}")
     dtype = _dtype(node)
-    values = [Value(shape, dtype) for shape in shapes]
+    values = [TensorValue(shape, dtype) for shape in shapes]
     for shape in shapes:
         if len(shape) > MAX_RANK or max(shape, default=0) > MAX_WORK:
             raise ValueError(f"its result has more than {MAX_RANK} dimensions or one above {MAX_WORK}")
@@ -218,7 +218,7 @@ def _expand(node: Node) -> list[Shape]:
     return [_broadcast(node.input(0).shape, _lengths(node.input(1)))]
 
 
-def _lengths(value: Value) -> Shape:
+def _lengths(value: TensorValue) -> Shape:
     lengths = value.integers()
     if any(n < 0 for n in lengths):
         raise ValueError(f"the lengths {lengths} hold a negative one")

@@ -24,7 +24,7 @@ GROUPS = ("sp", "pv", "mv", "applied", "law", "beside", "dv", "info")
 
 
 @dataclass(frozen=True, slots=True)
-class Scan:
+class ScanEntry:
     """One scan. ``numbers`` are the columns of its run, NaN where there was none; no ``quality``: all is good."""
 
     time_s: float  # since 1970
@@ -35,7 +35,7 @@ class Scan:
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class EventEntry:
     """A change by somebody, or an event.
 
     With ``alarm`` it begins (``raised``) or ends the alarm of that name; a new one of the same name ends the one
@@ -78,12 +78,14 @@ def packed(rows: Sequence[Sequence[Any]]) -> bytes:
     return zlib.compress(len(text).to_bytes(4, "little") + text + planes.tobytes(), 6)
 
 
-def unpacked(data: bytes) -> list[Scan]:
+def unpacked(data: bytes) -> list[ScanEntry]:
     """The scans that ``packed`` made one value of."""
     head, numbers = _opened(data)
     modes = [mode for mode, times in head["modes"] for _ in range(times)]
     return [
-        Scan(row[0], modes[i], tuple(row[1:]), tuple(head["quality"].get(str(i), ())), head["reason"].get(str(i), ""))
+        ScanEntry(
+            row[0], modes[i], tuple(row[1:]), tuple(head["quality"].get(str(i), ())), head["reason"].get(str(i), "")
+        )
         for i, row in enumerate(numbers.tolist())
     ]
 
@@ -124,9 +126,9 @@ class Entry:
     """An event as the log shows it: an alarm also with when it ended and who acknowledged it."""
 
     id: int
-    event: Event
+    event: EventEntry
     over_s: float | None
-    acknowledged: Event | None
+    acknowledged: EventEntry | None
 
 
 class JournalReader:
@@ -150,7 +152,7 @@ class JournalReader:
 
     def scans(
         self, after_id: int = 0, begin_s: float = -1e300, end_s: float = 1e300
-    ) -> Iterator[tuple[int, int, Scan]]:
+    ) -> Iterator[tuple[int, int, ScanEntry]]:
         """(id, run, scan) of the scans after an id and within times, in the order in which they were written.
 
         Their times follow that order unless the clock was set meanwhile.
@@ -173,7 +175,7 @@ class JournalReader:
                 )
                 for id_, run, time_s, mode, numbers, quality, reason in cursor:
                     values = tuple(np.frombuffer(numbers).tolist())
-                    yield id_, run, Scan(time_s, mode, values, tuple(json.loads(quality or "[]")), reason or "")
+                    yield id_, run, ScanEntry(time_s, mode, values, tuple(json.loads(quality or "[]")), reason or "")
             finally:
                 cursor.execute("rollback")
 
@@ -235,7 +237,7 @@ class JournalReader:
         row = self._base.execute("select value from learnt where name = ?", (name,)).fetchone()
         return None if row is None else str(row[0])
 
-    def events(self, after_id: int = 0, begin_s: float = -1e300, end_s: float = 1e300) -> list[tuple[int, Event]]:
+    def events(self, after_id: int = 0, begin_s: float = -1e300, end_s: float = 1e300) -> list[tuple[int, EventEntry]]:
         """(id, event) after an id and within times, in order."""
         rows = self._base.execute(
             f"select id, {EVENT} from event where id > ? and time between ? and ? order by id",
@@ -244,11 +246,11 @@ class JournalReader:
         return [(row[0], _event(row[1:])) for row in rows]
 
 
-def _event(row: Sequence[Any]) -> Event:
+def _event(row: Sequence[Any]) -> EventEntry:
     time_s, kind, who, what, reason, alarm, raised, about = row
-    return Event(time_s, kind, who, what, reason, alarm, bool(raised), about)
+    return EventEntry(time_s, kind, who, what, reason, alarm, bool(raised), about)
 
 
 def _entry(row: Sequence[Any]) -> Entry:
     *event, id_, over, who, time_s, reason = row
-    return Entry(id_, _event(event), over, None if who is None else Event(time_s, "acknowledged", who, "", reason))
+    return Entry(id_, _event(event), over, None if who is None else EventEntry(time_s, "acknowledged", who, "", reason))

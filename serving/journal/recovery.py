@@ -11,7 +11,7 @@ from enum import Enum
 from pathlib import Path
 from typing import TypeAlias
 
-from loopwright.serving.journal.entries import Event
+from loopwright.serving.journal.entries import EventEntry
 from loopwright.serving.journal.file import held, is_damage
 
 Identity: TypeAlias = tuple[int, int] | None  # device, inode; None: not there
@@ -161,11 +161,11 @@ def made_again(harm: Harm, lost: int, *, empty: bool, aside: Path | None, unstea
     )
 
 
-def alarm(time_s: float, what: str, over: str) -> list[Event]:
+def alarm(time_s: float, what: str, over: str) -> list[EventEntry]:
     """An alarm of the journal itself that is over already, and that somebody has to see."""
     return [
-        Event(time_s, "fault", "journal", what, alarm="journal", raised=True),
-        Event(time_s, "fault", "journal", over, alarm="journal"),
+        EventEntry(time_s, "fault", "journal", what, alarm="journal", raised=True),
+        EventEntry(time_s, "fault", "journal", over, alarm="journal"),
     ]
 
 

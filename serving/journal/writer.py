@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from loopwright.serving.errors import LoopError
-from loopwright.serving.journal.entries import Event, Scan, columns, packed
+from loopwright.serving.journal.entries import EventEntry, ScanEntry, columns, packed
 from loopwright.serving.journal.file import held, holds, is_damage, opened, sole_writer
 from loopwright.serving.journal.recovery import Harm, OpenFiles, alarm, cleared, copied, made_again
 from loopwright.serving.journal.waiting import Item, Waiting
@@ -153,11 +153,11 @@ class Journal:
         row = (time_s, f"{m.law} for {m.case}", sha256, m.period_s, speed, *texts)
         self._put("run", row)
 
-    def scan(self, scan: Scan) -> None:
+    def scan(self, scan: ScanEntry) -> None:
         """Write a scan down."""
         self._put("scan", scan)
 
-    def event(self, event: Event) -> None:
+    def event(self, event: EventEntry) -> None:
         """Write an event down."""
         self._put("event", event)
 
@@ -263,7 +263,7 @@ class Journal:
         )
         return int(cursor.lastrowid or 0)
 
-    def _noted(self, event: Event) -> int:
+    def _noted(self, event: EventEntry) -> int:
         self._events += 1
         cursor = self._base.execute(
             "insert into event (time, kind, who, what, reason, alarm, raised, about) values (?, ?, ?, ?, ?, ?, ?, ?)",
@@ -271,7 +271,7 @@ class Journal:
         )
         return int(cursor.lastrowid or 0)
 
-    def _note(self, events: list[Event]) -> None:
+    def _note(self, events: list[EventEntry]) -> None:
         """Write down what the journal has to say of itself."""
         with self._base:
             for event in events:

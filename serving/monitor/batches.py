@@ -24,7 +24,7 @@ LEAST_SHIFT = 0.002  # of a range: less is not worth a word
 FOREVER = 10**9  # scans: a block ends with its batch alone
 
 
-class Batches(Remembers):
+class BatchMeans(Remembers):
     """Means over eighths of each batch: every MV, every PV, what the law estimates; and ``Answers`` of a batch.
 
     A batch is a stretch in AUTO that the operator, or the recipe, ends with MANUAL or SHADOW. The first one gives

@@ -14,7 +14,7 @@ from loopwright.serving.guard import Sample
 from loopwright.serving.loop import Command, Mode
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.monitor.actuator_checks import AT_END, Following, Plight
-from loopwright.serving.monitor.batches import Batches
+from loopwright.serving.monitor.batches import BatchMeans
 from loopwright.serving.monitor.cusum import (
     DAY_S,
     TIME_S,
@@ -106,7 +106,7 @@ class Monitor:
             m, block=block, model=model, learn=learn, weekly=weekly, rate=rate, told=self.foresight.told
         )
         self.estimates = Estimates(m.info, block=block, learn=learn, weekly=weekly, rate=rate)
-        self.batches = Batches(m, rate)
+        self.batches = BatchMeans(m, rate)
         self.swings = [Swing(BAND * (s.high - s.low)) for s in m.sp]
         self.plight = Plight(m.mv, 2 * self.settle)
         self.following = Following(m.mv, self.settle)

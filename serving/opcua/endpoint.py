@@ -18,13 +18,13 @@ from loopwright.serving.errors import EndpointError, LoopError
 from loopwright.serving.guard import Sample
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.heartbeat import Heartbeat
-from loopwright.serving.opcua.lease import LeaseRefusedError, NodeLease
 from loopwright.serving.opcua.link import Link
 from loopwright.serving.opcua.nameplates import Identity, Nameplates, identity, whole
-from loopwright.serving.opcua.plan import Plan
-from loopwright.serving.opcua.sampling import Ages, Sampling, Values
+from loopwright.serving.opcua.node_lease import LeaseRefusedError, NodeLease
+from loopwright.serving.opcua.plan import NodePlan
+from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import GOOD, LateError, Reading, words
+from loopwright.serving.opcua.values import GOOD, LateError, NodeReading, words
 from loopwright.serving.words import first_line, named
 
 __all__ = ["OpcUaEndpoint", "Values"]
@@ -99,7 +99,7 @@ class OpcUaEndpoint:
         self._slowest_s = MOST_LEAD * self.period_s  # until answers are known
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
-        self._missed = ""  # why the last reading failed at once, or the connection did; late answers grow old instead
+        self._read_failure = ""  # why the last reading failed at once, or the connection did; late ones grow old
         self._given: Values | None = None  # at the last scan
         self.unwritten = ""  # why the last MV did not reach the plant
         self._barred = ""  # why this connection takes none
@@ -113,10 +113,10 @@ class OpcUaEndpoint:
         self._called = self._asked = 0  # the scans of the last calls to write and to hand_back
         # Which connection has shown where the plant is (0: the present one has not, since a write failed if one did),
         # and which one `read` told of.
-        self._shown, self._told = 0, 0
+        self._shown_on, self._told_on = 0, 0
         self.lease = NodeLease(self.period_s)
         self.nameplates, self._identified = Nameplates(nodes, manifest, spaces), identified
-        self._heartbeat, self._sampling = Heartbeat(), Sampling(manifest, server, nodes, self.nameplates)
+        self._heartbeat, self._sampling = Heartbeat(), NodeSampling(manifest, server, nodes, self.nameplates)
         self._handed_back = False
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -143,7 +143,7 @@ class OpcUaEndpoint:
 
     def read(self) -> Sample:
         """The last values; EndpointError where there are none that are young enough."""
-        self._told = self._shown
+        self._told_on = self._shown_on
         values = self.values  # before the time is taken: newer ones may arrive meanwhile, from the future as it were
         now = self.clock()
         self._scans += 1
@@ -151,15 +151,15 @@ class OpcUaEndpoint:
         self._stir()
         if values is None:
             raise EndpointError(self.trouble or "no values yet")
-        if self._missed and values is self._given:
-            raise EndpointError(self._missed)  # the reading for this scan has failed, and this is the one before
+        if self._read_failure and values is self._given:
+            raise EndpointError(self._read_failure)  # the reading for this scan has failed, and this is the one before
         self._given = values
         age = now - values.arrived_s + values.age_s
         if self.trouble and age > self.max_age_s:
             raise EndpointError(self.trouble)
         # An MV of long ago, or from before a write that failed, is none that the plant has now; an old PV may come with
         # a young MV.
-        mv = values.mv if self._told and now - values.arrived_s <= self.max_age_s else None
+        mv = values.mv if self._told_on and now - values.arrived_s <= self.max_age_s else None
         late = self._late(values, now)
         return Sample(values.pv, mv, values.dv, age * self.speed, values.fault, values.quality, late)
 
@@ -178,7 +178,7 @@ class OpcUaEndpoint:
         if now - before > 1:
             self.unwritten = ""  # of a time after which nothing was written: it says nothing of now
         refused = self.unwritten or self.nameplates.unwritable or self._barred
-        if self._link is None or self._shown == 0 or self._told != self._shown:
+        if self._link is None or self._shown_on == 0 or self._told_on != self._shown_on:
             unread = "where the MV stands has not been read yet"
             self._refuse(self.trouble or refused or ("not connected" if self._link is None else unread))
         if refused:
@@ -249,7 +249,7 @@ class OpcUaEndpoint:
             try:
                 patience_s = max(self.answer_s, self.server.connect_s)
                 await self.nameplates.require_spaces(link, patience_s)
-                plan = await Plan.made(link, self.manifest, self.nodes, patience_s)
+                plan = await NodePlan.made(link, self.manifest, self.nodes, patience_s)
                 await self.nameplates.look(link, plan, patience_s)
                 self.connections += 1
                 anew = await self._anew(link)
@@ -259,7 +259,7 @@ class OpcUaEndpoint:
                 if self._outbox:
                     self._outbox.clear()  # what was to be written then is too old now
                     self.unwritten = self.unwritten or "the connection was lost before the MV was sent"
-                self._written, self._shown, self._barred = None, 0, plan.unwritable
+                self._written, self._shown_on, self._barred = None, 0, plan.unwritable
                 self._link = link
                 pause = FIRST_RETRY_S
                 self._told_lost = ""
@@ -267,7 +267,7 @@ class OpcUaEndpoint:
                 self.tell(f"connected to {self.server.endpoint}{anew}; {await self._leased(link, plan)}")
                 self.nameplates.moved = None
                 watching = asyncio.create_task(self.nameplates.watch(link, plan, patience_s))
-                await self._exchange(link, plan)
+                await self._serve_connection(link, plan)
             except Exception as error:
                 why = first_line(error) if isinstance(error, LoopError) else named(error)
                 self._lost(why, late=isinstance(error, LateError))
@@ -285,7 +285,7 @@ class OpcUaEndpoint:
             await self._rest(pause)
             pause = min(pause * GROWTH, LAST_RETRY_S)
 
-    async def _leased(self, link: Link, plan: Plan) -> str:
+    async def _leased(self, link: Link, plan: NodePlan) -> str:
         """The lease that keeps loops on other machines from writing the same MVs, in words."""
         if plan.lease is None:
             return plan.unwritable or "no lease"
@@ -306,7 +306,7 @@ class OpcUaEndpoint:
         """Say it once. A silent server has been the trouble for some scans already, and was not told as lost."""
         self.connected = False
         if not late:
-            self._missed = why
+            self._read_failure = why
         if why != self._told_lost:
             self.tell(why)
         self.trouble = self._told_lost = why
@@ -321,7 +321,7 @@ class OpcUaEndpoint:
                     await self._wake.wait()
             self._wake.clear()
 
-    async def _exchange(self, link: Link, plan: Plan) -> None:
+    async def _serve_connection(self, link: Link, plan: NodePlan) -> None:
         """Read and write until the connection is lost, which raises EndpointError, or the endpoint closed."""
         assert self._wake is not None
         ages, silent, read_at = Ages(len(plan.timed)), 0, -float("inf")
@@ -347,7 +347,7 @@ class OpcUaEndpoint:
                     silent += 1
                     self.trouble = first_line(error)
                     if not isinstance(error, LateError):
-                        self._missed = self.trouble
+                        self._read_failure = self.trouble
                     if silent >= SILENT_SCANS or link.gone:
                         raise
                     continue
@@ -356,14 +356,14 @@ class OpcUaEndpoint:
                 self.values = self._sampling.valued(
                     plan, answers, ages, self.clock(), unbeaten=self._heartbeat.trouble, starts=self.starts
                 )
-                self.trouble, self._missed, self._shown = "", "", self.connections
+                self.trouble, self._read_failure, self._shown_on = "", "", self.connections
             else:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(due - now):
                         await self._wake.wait()
                 self._wake.clear()
 
-    async def _send(self, link: Link, plan: Plan) -> None:
+    async def _send(self, link: Link, plan: NodePlan) -> None:
         """Write what waits. A server that refuses is a fault; one that does not answer loses the connection."""
         last: Array | str | None = None
         with suppress(IndexError):  # the loop may take out what waits
@@ -408,10 +408,10 @@ class OpcUaEndpoint:
 
     def _failed(self, why: str) -> None:
         """A write did not arrive: only a reading that is asked for from now on tells where the MV stands."""
-        self._shown = 0
+        self._shown_on = 0
         self.unwritten = why
 
-    async def _lease(self, link: Link, node: ua.NodeId, answer: Reading) -> None:
+    async def _lease(self, link: Link, node: ua.NodeId, answer: NodeReading) -> None:
         """Keep the lease while MVs are written, and let it go when they are not: a shadow needs none."""
         self.lease.seen(answer.words_held)
         if not self.lease.held:

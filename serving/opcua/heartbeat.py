@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from loopwright.serving.errors import EndpointError
 from loopwright.serving.opcua.link import Link
-from loopwright.serving.opcua.plan import Plan
+from loopwright.serving.opcua.plan import NodePlan
 from loopwright.serving.opcua.values import GOOD, variant, words
 from loopwright.serving.words import first_line
 
@@ -16,7 +16,7 @@ class Heartbeat:
         self.trouble = ""
         self._beats = 0  # scans that were counted
 
-    async def beat(self, link: Link, plan: Plan, scans: int, answer_s: float) -> None:
+    async def beat(self, link: Link, plan: NodePlan, scans: int, answer_s: float) -> None:
         """Write how many ``scans`` there were, if there are new ones.
 
         A node that has another type now is counted in that one from the next scan on.

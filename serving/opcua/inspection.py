@@ -16,7 +16,6 @@ from loopwright.serving.errors import EndpointError
 from loopwright.serving.guard import InRange, Sample, implausible
 from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.opcua.certificates import last_day, valid_until
-from loopwright.serving.opcua.lease import NAME, WRITABLE, SeveralLeasesError, beside
 from loopwright.serving.opcua.link import Link
 from loopwright.serving.opcua.nameplates import (
     Identity,
@@ -30,10 +29,11 @@ from loopwright.serving.opcua.nameplates import (
     uri_of,
     whole,
 )
-from loopwright.serving.opcua.plan import Plan, Role, Row, shared_node
+from loopwright.serving.opcua.node_lease import NAME, WRITABLE, SeveralLeasesError, beside
+from loopwright.serving.opcua.plan import NodePlan, Role, Row, shared_node
 from loopwright.serving.opcua.sampling import NO_NUMBERS
 from loopwright.serving.opcua.settings import NO_LEASE, Nodes, Point, Server
-from loopwright.serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, Reading, exact, words
+from loopwright.serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, NodeReading, exact, words
 from loopwright.serving.words import first_line
 
 NO_LEASE_NOTE = (
@@ -69,7 +69,7 @@ class _Asked(NamedTuple):
     """The server's answers about one node."""
 
     at: ua.NodeId
-    reading: Reading
+    reading: NodeReading
     writable: bool | None  # by this user; None: the server does not say
     plate: Plate
 
@@ -105,7 +105,7 @@ async def _inspected(
 ) -> Inspection:
     link = await Link.opened(server)
     try:
-        plan = Plan(nodes, manifest)
+        plan = NodePlan(nodes, manifest)
         # A watchdog that cannot be read counts as dead, though no sample is judged by its quality.
         read = [replace(row, judged=row.judged or row.role is Role.WATCHDOG) for row in plan.rows]
         rows = [*read, *plan.outputs, *plan.extra]
@@ -227,7 +227,7 @@ def _lease(node: str, asked: _Asked | str) -> Found:
     )
 
 
-def _bad(reading: Reading, node: str) -> str:
+def _bad(reading: NodeReading, node: str) -> str:
     unknown = words(reading.status) == "BadNodeIdUnknown"
     return f"its quality is {words(reading.status)}" + (f"; the server has no node {node}" if unknown else "")
 

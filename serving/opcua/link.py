@@ -24,7 +24,7 @@ from loopwright.serving.opcua.values import (
     TOO_MANY,
     BusyError,
     LateError,
-    Reading,
+    NodeReading,
     in_time,
     reading,
     reason,
@@ -191,7 +191,7 @@ class Link:
 
     async def read(
         self, nodes: Sequence[ua.NodeId], timeout_s: float, attribute: ua.AttributeIds = ua.AttributeIds.Value
-    ) -> list[Reading]:
+    ) -> list[NodeReading]:
         """The values of nodes, in as few requests as the server allows."""
         return [reading(v) for v in await self.values(nodes, timeout_s, attribute)]
 

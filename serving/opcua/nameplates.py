@@ -18,7 +18,7 @@ from loopwright.serving.errors import EndpointError
 from loopwright.serving.guard import Fault
 from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.opcua.link import Link, node_id
-from loopwright.serving.opcua.plan import Plan, Role, Row
+from loopwright.serving.opcua.plan import NodePlan, Role, Row
 from loopwright.serving.opcua.settings import Nodes, Point
 from loopwright.serving.opcua.values import FLOATS, INTEGERS, unanswered
 
@@ -115,7 +115,7 @@ class Nameplates:
         words = f"{name}: its type is {kind.name} now and was {before.name}; a restart of the loop accepts it"
         return Fault(words, "type", name)
 
-    async def look(self, link: Link, plan: Plan, timeout_s: float) -> None:
+    async def look(self, link: Link, plan: NodePlan, timeout_s: float) -> None:
         """See which unit, range and type each node has now; EndpointError where nobody answers."""
         rows = plan.measuring()
         nodes = [node for _, node in rows]
@@ -134,7 +134,7 @@ class Nameplates:
         self.fault = next((why for (row, _), why in self._wrong.items() if row.measured), "")
         self.unwritable = next((why for (row, _), why in self._wrong.items() if row.written), "")
 
-    def seen(self, plan: Plan) -> dict[str, Seen]:
+    def seen(self, plan: NodePlan) -> dict[str, Seen]:
         """The nodes by row as they were when the loop began."""
         found = {}
         for row, _ in plan.measuring():
@@ -142,7 +142,7 @@ class Nameplates:
             found[row.name] = Seen(row.node, UNKNOWN if kind is None else kind.name, *plate)
         return found
 
-    async def watch(self, link: Link, plan: Plan, timeout_s: float) -> None:
+    async def watch(self, link: Link, plan: NodePlan, timeout_s: float) -> None:
         """Look again now and then, until a node is another one: ``moved`` then says so."""
         while True:
             await asyncio.sleep(WRONG_S if self.wrong else LOOK_S)
@@ -155,7 +155,7 @@ class Nameplates:
             except EndpointError:  # the loop's own readings judge a server that is silent
                 continue
 
-    async def again(self, link: Link, plan: Plan, timeout_s: float) -> None:
+    async def again(self, link: Link, plan: NodePlan, timeout_s: float) -> None:
         """All that may change without a new connection. ChangedNodeError, EndpointError."""
         await self.require_spaces(link, timeout_s, anew=True)
         await self.look(link, plan, timeout_s)

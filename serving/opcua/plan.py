@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from loopwright.serving.errors import EndpointError, LoopError
 from loopwright.serving.manifest import Manifest, Signal
-from loopwright.serving.opcua.lease import SeveralLeasesError, beside
 from loopwright.serving.opcua.link import Link
+from loopwright.serving.opcua.node_lease import SeveralLeasesError, beside
 from loopwright.serving.opcua.settings import NO_LEASE, Nodes, Point
 from loopwright.serving.opcua.values import exact, variant
 from loopwright.serving.words import first_line
@@ -80,7 +80,7 @@ class Row:
         return self.judged and self.role is not Role.MV
 
 
-class Plan:
+class NodePlan:
     """The nodes of one connection, with the types that they have in it."""
 
     def __init__(self, nodes: Nodes, manifest: Manifest) -> None:
@@ -113,7 +113,7 @@ class Plan:
         self._hand_back: tuple[ua.NodeId, ua.VariantType] | None = None
 
     @classmethod
-    async def made(cls, link: Link, manifest: Manifest, nodes: Nodes, timeout_s: float) -> Plan:
+    async def made(cls, link: Link, manifest: Manifest, nodes: Nodes, timeout_s: float) -> NodePlan:
         """Ask the server for ids and types."""
         plan = cls(nodes, manifest)
         written = [*plan.outputs, *plan.extra]

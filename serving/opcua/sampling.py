@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from loopwright.serving.guard import Fault
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.nameplates import Nameplates
-from loopwright.serving.opcua.plan import Plan, Role, Row
+from loopwright.serving.opcua.plan import NodePlan, Role, Row
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import BAD, GOOD, UNCERTAIN, Reading
+from loopwright.serving.opcua.values import BAD, GOOD, UNCERTAIN, NodeReading
 
 DRIFT = 2e-4  # seconds a second by which two clocks may part
 JUMP_S = 600.0  # by more than that no value is late: a clock was set
@@ -110,7 +110,7 @@ class Values:
     unheard: Mapping[str, str] = field(default_factory=dict)  # why a set point or the mode is no wish, by name
 
 
-class Sampling:
+class NodeSampling:
     """Makes values of answers. It remembers the plant's watchdog, and the nodes' types, from reading to reading."""
 
     def __init__(self, manifest: Manifest, server: Server, nodes: Nodes, nameplates: Nameplates | None = None) -> None:
@@ -120,7 +120,14 @@ class Sampling:
         self._dead, self._slow = "", False  # why the plant counts as dead; whether its watchdog has moved since
 
     def valued(
-        self, plan: Plan, answers: Sequence[Reading], ages: Ages, arrived_s: float, *, unbeaten: str, starts: int
+        self,
+        plan: NodePlan,
+        answers: Sequence[NodeReading],
+        ages: Ages,
+        arrived_s: float,
+        *,
+        unbeaten: str,
+        starts: int,
     ) -> Values:
         """Values that arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not arrive."""
         fault, typed, found, unheard = "", "", dict[str, float](), dict[str, str]()

@@ -32,7 +32,7 @@ EPOCH = datetime(1970, 1, 1)
 GOOD, UNCERTAIN, BAD = 0, 1, 2  # the two highest bits of a status
 
 
-class Reading(NamedTuple):
+class NodeReading(NamedTuple):
     """A node's value. ``number`` is NaN where there is none, and ``text`` then says what is there instead."""
 
     number: float
@@ -53,7 +53,7 @@ class Reading(NamedTuple):
         return words(self.status)
 
 
-def reading(value: ua.DataValue) -> Reading:
+def reading(value: ua.DataValue) -> NodeReading:
     """A server's answer as a number with its quality and time."""
     status = int(value.StatusCode.value) if value.StatusCode is not None else 0
     when = value.SourceTimestamp
@@ -63,9 +63,9 @@ def reading(value: ua.DataValue) -> Reading:
     given = None if inner is None else inner.Value
     if isinstance(given, bool | int | float) and not isinstance(given, ua.StatusCode):
         number = float(given)
-        return Reading(number, status, source, kind, "" if math.isfinite(number) else f"{number}")
+        return NodeReading(number, status, source, kind, "" if math.isfinite(number) else f"{number}")
     text = "no value" if given is None else f"{type(given).__name__} instead of a number"
-    return Reading(math.nan, status, source, kind, text, given if isinstance(given, str) else "")
+    return NodeReading(math.nan, status, source, kind, text, given if isinstance(given, str) else "")
 
 
 def variant(value: float, kind: ua.VariantType, low: float, high: float) -> ua.Variant:

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 
 from loopwright.serving.errors import LoopError, LoopwrightError, NotProvenError
 from loopwright.serving.first_steps import DEADLINE_S
-from loopwright.serving.station.lease import runtime_folder
+from loopwright.serving.station.mv_lock import runtime_folder
 from loopwright.serving.words import first_line, named, plain
 
 Answer: TypeAlias = dict[str, Any]

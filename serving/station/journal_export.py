@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from loopwright.serving.errors import LoopError
-from loopwright.serving.journal import Event, JournalReader, Scan
+from loopwright.serving.journal import EventEntry, JournalReader, ScanEntry
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.words import plain
 
@@ -26,7 +26,7 @@ def journal_of(file: Path) -> Path:
     return Settings.read(file).journal.file if file.suffix == ".toml" else file
 
 
-def happened(journal: Path, since: str = "", last: int | None = None) -> list[Event]:
+def happened(journal: Path, since: str = "", last: int | None = None) -> list[EventEntry]:
     """The events of a journal, oldest first: all, or those from ``since`` on, and of these the ``last`` ones.
 
     ``since`` is in ISO 8601, and UTC where it names no zone. LoopError where it is no time, or ``last`` is below 1.
@@ -39,7 +39,7 @@ def happened(journal: Path, since: str = "", last: int | None = None) -> list[Ev
     return events if last is None else events[-last:]
 
 
-def lines(events: Sequence[Event]) -> list[str]:
+def lines(events: Sequence[EventEntry]) -> list[str]:
     """A line an event: when, of which kind, who, what, and the reason in brackets."""
     rows = [_cells(event) for event in events]
     widths = [max((len(row[i]) for row in rows), default=0) for i in range(3)]
@@ -50,14 +50,14 @@ def lines(events: Sequence[Event]) -> list[str]:
     return found
 
 
-def write_csv(events: Sequence[Event], out: TextIO) -> None:
+def write_csv(events: Sequence[EventEntry], out: TextIO) -> None:
     """A row an event, below the names of the columns."""
     table = csv.writer(out, lineterminator="\n")
     table.writerow(FIELDS)
     table.writerows(_cells(event) for event in events)
 
 
-def _cells(event: Event) -> list[str]:
+def _cells(event: EventEntry) -> list[str]:
     # An acknowledgement is written down with the text of its alarm.
     what = f"acknowledged: {event.what}" if event.kind == "acknowledged" else event.what
     moment = datetime.fromtimestamp(event.time_s, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
@@ -127,7 +127,7 @@ def export(journal: Path, out: Path) -> int:
     return count
 
 
-def _believed(scan: Scan, columns: Sequence[str]) -> dict[str, float]:
+def _believed(scan: ScanEntry, columns: Sequence[str]) -> dict[str, float]:
     """The numbers of a scan by column, NaN for what was measured with a quality that is not to be believed.
 
     A loop that does not use values of uncertain quality has a fault at each; one that it uses comes without.

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample, kind_of, lasting
-from loopwright.serving.journal import Event, Journal, JournalReader, Scan
+from loopwright.serving.journal import EventEntry, Journal, JournalReader, ScanEntry
 from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest
@@ -70,7 +70,7 @@ class Recorder:
         what, reason = plain(what), plain(reason)
         if mode is not None:
             self._mode = mode.value
-        self.journal.event(Event(time.time(), kind, who, what, reason, alarm, raised, about))
+        self.journal.event(EventEntry(time.time(), kind, who, what, reason, alarm, raised, about))
         said = f"acknowledged: {what}" if kind == "acknowledged" else what
         self._say(f"{who}: {said}" + (f" ({reason})" if reason else ""))
 
@@ -78,7 +78,7 @@ class Recorder:
         """Write a scan down, and the fault or the new controller that came with it."""
         numbers = tuple(map(float, _numbers(self.controller.manifest, sample, command)))
         quality = () if sample is None else sample.quality
-        self.journal.scan(Scan(time.time(), command.mode.value, numbers, quality, command.reason))
+        self.journal.scan(ScanEntry(time.time(), command.mode.value, numbers, quality, command.reason))
         # A reason whose numbers change, such as an age, is the same fault.
         if command.reason != self._fault and kind_of(command.reason) != kind_of(self._fault):
             before, self._fault = self._fault, command.reason

@@ -17,7 +17,6 @@ from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError, LoopwrightError
 from loopwright.serving.first_steps import tried
-from loopwright.serving.grid import RunReport
 from loopwright.serving.guard import Sample
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.loop import Command, ControlLoop, Mode
@@ -27,6 +26,7 @@ from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.nameplates import Identity, others_since
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.page.process import PageProcess
+from loopwright.serving.scan_grid import RunReport
 from loopwright.serving.station.build_loop import (
     another_before,
     begun_at,
@@ -40,7 +40,7 @@ from loopwright.serving.station.build_loop import (
 )
 from loopwright.serving.station.control import Answer, Control
 from loopwright.serving.station.housekeeping import Said, Tending
-from loopwright.serving.station.lease import Lease, Locks
+from loopwright.serving.station.mv_lock import Lease, Locks
 from loopwright.serving.station.recorder import Recorder, Watching
 from loopwright.serving.station.requests import Change, Request, Wishes, change, require_proven
 from loopwright.serving.station.settings import Settings
@@ -115,8 +115,8 @@ class Station:
         self.loop: ControlLoop | None = None
         self.snapshot: Snapshot | None = None  # of the last scan; all that other threads read of it
         self._left_at: Array | None = None  # shape: (n_mv,), the last command that was known
-        self.scans = self._faults = self._missed = 0
-        self._blind = False  # begun without a value of the plant, and none since
+        self.scans = self._faults = self._missed_periods = 0
+        self._begun_unseen = False  # begun without a value of the plant, and none since
         self.warnings: list[str] = []
         self.ended = False
         self.page: PageProcess | None = None
@@ -171,7 +171,7 @@ class Station:
             if self.ended:
                 self.recorder.note("change", "loop", "ended before the first scan: nothing was written")
                 return RunReport(0, 0, 0, 0.0)
-            self._blind = first is None
+            self._begun_unseen = first is None
             pv = None if first is None else first.pv[: len(m.sp)]
             mv = None if first is None else begun_at(first.mv, m.mv)
             self.loop = control_loop(s, self.controller, self.endpoint, sp=near(pv, m.sp), mv=mv, clock=self.clock)
@@ -222,7 +222,7 @@ class Station:
     def _before(self, k: int) -> None:
         """Changes that were asked for, here or on the plant's side."""
         assert self.loop is not None
-        self._missed = k - self.scans
+        self._missed_periods = k - self.scans
         self._at_last(self.loop)
         # Before the first scan nobody knows where the MV stands.
         while self.scans and not self.changes.empty():
@@ -245,8 +245,8 @@ class Station:
     def _at_last(self, loop: ControlLoop) -> None:
         """A shadow that began without the plant begins at its PVs once it sees them, unless a set point was named."""
         values, sp = self.endpoint.values, self.manifest.sp
-        if self._blind and values is not None and usable(values):
-            self._blind = False
+        if self._begun_unseen and values is not None and usable(values):
+            self._begun_unseen = False
             if loop.sp.tolist() == near(None, sp):
                 loop.set_sp(near(values.pv[: len(sp)], sp))
                 self.recorder.note("change", "loop", f"set point {_shown(loop.sp, sp)}", "where the plant stands")
@@ -300,7 +300,7 @@ class Station:
             self.recorder.scan(self.loop, sample, command)
             self.watching.seen(stepped, seen)
         finally:  # a scan that cannot be written down is a scan
-            counts = self._missed, self._faults
+            counts = self._missed_periods, self._faults
             self.snapshot = Snapshot.of(self.loop, self.watching.monitor, seen, stepped, counts)
         for show in self._watchers:
             show(sample, command)

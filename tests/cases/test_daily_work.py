@@ -16,7 +16,7 @@ from loopwright.pipeline.cases.own_tests import LEAST, MOST, day, spread, window
 from loopwright.pipeline.evaluation.trials import Trials
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.metrics import mae
-from loopwright.pipeline.records.record_file import SetPoints, stretches
+from loopwright.pipeline.records.record_file import RecordedSetPoints, stretches
 from loopwright.pipeline.simulation.simulate import simulate_closed
 from loopwright.pipeline.tuning.rules import PidSettings
 
@@ -45,7 +45,7 @@ def record(same_row: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def own(values: np.ndarray, pv: np.ndarray, mv: np.ndarray) -> OwnCase:
     models = [scaled_model(1, 1, 0, 1, a=[[p]], b=[[(1 - p) * GAIN]], rest=np.eye(1, 3)) for p in POLES]
     case = case_of(section(1, 1), models, pv, mv)
-    SetPoints(("y0",), values).write(case.data)
+    RecordedSetPoints(("y0",), values).write(case.data)
     return case
 
 
@@ -128,9 +128,9 @@ def test_stretches_end_at_runs_and_at_what_is_not_known() -> None:
 
 def test_set_points_come_back_by_the_names_of_their_pvs(tmp_path: Path) -> None:
     values = np.array([[1.0, np.nan], [2.0, 3.0]])
-    SetPoints(("a", "b"), values).write(tmp_path / "record.parquet")
-    found = SetPoints.beside(tmp_path / "record.parquet")
+    RecordedSetPoints(("a", "b"), values).write(tmp_path / "record.parquet")
+    found = RecordedSetPoints.beside(tmp_path / "record.parquet")
     assert found is not None
     np.testing.assert_array_equal(found.of(["b", "a"]), values[:, ::-1])
     assert found.of(["a", "c"]) is None
-    assert SetPoints.beside(tmp_path / "other" / "record.parquet") is None
+    assert RecordedSetPoints.beside(tmp_path / "other" / "record.parquet") is None

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.pipeline.__main__ import main
-from loopwright.pipeline.commands import COMMANDS, Parser, loaded
+from loopwright.pipeline.commands import COMMANDS, OneLineParser, loaded
 from loopwright.pipeline.commands.parameters import texts, type_of
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.models import MODELS
@@ -129,7 +129,7 @@ def test_the_type_of_a_parameter_does_not_depend_on_how_its_module_reads_annotat
 
 def parsed(*words: str) -> dict[str, object]:
     """What a command reads in its words."""
-    parser = Parser(prog=words[0])
+    parser = OneLineParser(prog=words[0])
     loaded(words[0]).options(parser)
     found = vars(parser.parse_args(words[1:]))
     return {key: value for key, value in found.items() if not callable(value)}

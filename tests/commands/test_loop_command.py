@@ -25,7 +25,7 @@ from loopwright.serving.opcua.nameplates import other_unit
 from loopwright.serving.opcua.plan import Role, Row
 from loopwright.serving.opcua.settings import Point
 from loopwright.serving.station.command import JOURNAL_LOST
-from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.settings import Settings
 
 ROOT = Path(__file__).parents[2]

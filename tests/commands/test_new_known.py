@@ -18,7 +18,7 @@ from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.historian.cleaning.tags import Tag, read_tags
 from loopwright.pipeline.historian.export_params import exported, signal_tags
 from loopwright.pipeline.historian.guessing import controlled_first, loop_in
-from loopwright.pipeline.historian.old_loops import _partner
+from loopwright.pipeline.historian.old_loop_fit import _partner
 from loopwright.pipeline.stages.fit import Fits
 
 ROLES = ["--pv", "TIC-101.PV[degC]=0..120", "--mv", "TIC-101.OP[%]", "--dv", "FI-7[kg/h]"]

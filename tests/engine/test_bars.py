@@ -15,7 +15,7 @@ from rich.console import Console
 
 from loopwright.pipeline.engine.output import BARS, MARK
 from loopwright.pipeline.engine.parallel_dvc import Bars
-from loopwright.pipeline.engine.progress import Lines, Piece
+from loopwright.pipeline.engine.progress import Lines, WorkPiece
 
 
 def drawn(terminal: bool) -> tuple[Bars, io.StringIO]:
@@ -28,7 +28,7 @@ def test_a_marked_line_moves_the_bar_of_its_stage_and_no_text_is_lost(monkeypatc
     now = [0.0]
     out = io.StringIO()
     monkeypatch.setattr(sys, "stderr", out)
-    piece = Piece("fit a: networks", 10.0, Lines(lambda: now[0]))
+    piece = WorkPiece("fit a: networks", 10.0, Lines(lambda: now[0]))
     for at, done in ((0.2, 1), (20.0, 4), (20.1, 5), (40.0, 8)):
         now[0] = at
         piece.show(done, "of no use here")

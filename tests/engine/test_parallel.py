@@ -14,7 +14,7 @@ from engine_pieces import folder_of
 from loopwright.pipeline.engine import pieces, start
 from loopwright.pipeline.engine.cluster import address, workers_here
 from loopwright.pipeline.engine.fingerprint import difference, fingerprint
-from loopwright.pipeline.engine.folder import Folder, apply, read_files
+from loopwright.pipeline.engine.folder import NewFolder, apply, read_files
 from loopwright.pipeline.engine.parallel import as_done, parallel_map
 from loopwright.pipeline.engine.pieces import lost
 from loopwright.pipeline.errors import PipelineError
@@ -156,7 +156,7 @@ def test_files_come_back_as_they_were_sent(tmp_path: Path, monkeypatch: pytest.M
     apply({"deep/in/a.txt": b"1", "b.txt": b"2"})
     files = read_files([Path("deep"), Path("b.txt"), Path("missing"), Path("/etc/hostname"), Path("../b.txt")])
     assert files == {"deep/in/a.txt": b"1", "b.txt": b"2"}
-    with Folder(files) as folder:
+    with NewFolder(files) as folder:
         assert folder.changes() == {}
         Path("b.txt").write_bytes(b"3")  # as long as it was
         assert folder.changes() == {"b.txt": b"3"}

@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.pipeline.engine import progress
 from loopwright.pipeline.engine.parallel import parallel_map
-from loopwright.pipeline.engine.progress import EVERY_S, Lines, Piece, steps, within
+from loopwright.pipeline.engine.progress import EVERY_S, Lines, WorkPiece, steps, within
 
 
 class Clock:
@@ -32,7 +32,7 @@ def clock() -> Iterator[Clock]:
 
 def test_a_piece_says_what_is_done_and_how_long_the_rest_takes(capsys: pytest.CaptureFixture[str]) -> None:
     clock = Clock()
-    piece = Piece("fit a: networks", 40.0, Lines(clock))
+    piece = WorkPiece("fit a: networks", 40.0, Lines(clock))
     assert capsys.readouterr().err == ""
     for after, done in ((15.0, 4.0), (20.0, 8.0), (30.0, 10.0), (200.0, 38.0)):
         clock.now = 100.0 + after

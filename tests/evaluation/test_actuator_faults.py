@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.pipeline.evaluation.stress.draws import SLOW, SPAN, STUCK, ZERO, Actuators, Fault, draw_fault
+from loopwright.pipeline.evaluation.stress.draws import SLOW, SPAN, STUCK, ZERO, ActuatorFault, Actuators, draw_fault
 from loopwright.serving import Signal
 
 VALVE = (Signal("valve", "%", 0.0, 100.0),)
 
 
-def moved(fault: Fault | None, commands: list[float], *, late: bool = False) -> tuple[list[float], list[float]]:
+def moved(fault: ActuatorFault | None, commands: list[float], *, late: bool = False) -> tuple[list[float], list[float]]:
     """(positions, what the plant receives) from 50 % on."""
     actuators = Actuators(VALVE, [fault], np.array([[50.0]]), [late])
     rows = [actuators.move(k, np.array([[u]])) for k, u in enumerate(commands)]
@@ -22,13 +22,13 @@ def moved(fault: Fault | None, commands: list[float], *, late: bool = False) -> 
     ("fault", "positions", "acting"),
     [
         (None, [60, 20, 100], [60, 20, 100]),
-        (Fault(STUCK, 0, start=1, end=2), [60, 60, 100], [60, 60, 100]),
-        (Fault(SLOW, 0, size=5.0), [60, 40, 60], [60, 40, 60]),
-        (Fault(ZERO, 0, size=0.02), [60, 20, 100], [62, 22, 100]),
-        (Fault(SPAN, 0, size=-0.05), [60, 20, 100], [57, 19, 95]),
+        (ActuatorFault(STUCK, 0, start=1, end=2), [60, 60, 100], [60, 60, 100]),
+        (ActuatorFault(SLOW, 0, size=5.0), [60, 40, 60], [60, 40, 60]),
+        (ActuatorFault(ZERO, 0, size=0.02), [60, 20, 100], [62, 22, 100]),
+        (ActuatorFault(SPAN, 0, size=-0.05), [60, 20, 100], [57, 19, 95]),
     ],
 )
-def test_a_fault_does_what_it_says(fault: Fault | None, positions: list[float], acting: list[float]) -> None:
+def test_a_fault_does_what_it_says(fault: ActuatorFault | None, positions: list[float], acting: list[float]) -> None:
     assert moved(fault, [60.0, 20.0, 100.0]) == (pytest.approx(positions), pytest.approx(acting))
 
 

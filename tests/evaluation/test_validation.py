@@ -11,16 +11,16 @@ from typing import Any
 import pytest
 
 from loopwright.pipeline.errors import PipelineError
-from loopwright.pipeline.evaluation.law_evidence import Analysis, lock_up_text
-from loopwright.pipeline.evaluation.leaderboard import Standing
+from loopwright.pipeline.evaluation.law_evidence import FormAnalysis, lock_up_text
+from loopwright.pipeline.evaluation.leaderboard import CaseStanding
 from loopwright.pipeline.evaluation.validation import (
     FILE,
     SCHEMA,
+    CheckedStatement,
     GateRecord,
     GateResult,
     LawResult,
     PaperResult,
-    Statement,
     Titles,
     Validation,
 )
@@ -51,11 +51,14 @@ def validation() -> Validation:
         ),
         laws={
             "pid": LawResult(1, 0, 20.0),
-            "inc": LawResult(5, 4, None, LOCKED, True, {"base": Analysis({"radius": 0.9}, ("Not proved.",))}),
+            "inc": LawResult(5, 4, None, LOCKED, True, {"base": FormAnalysis({"radius": 0.9}, ("Not proved.",))}),
         },
         titles=Titles("The tank", "mean absolute error", "MAE", {}, {"pid": "PID"}, {"steps": "Steps"}),
-        requirements=(Statement("fast", "≤ 1 s", "0.5 s", True),),
-        claims=(Statement("stable", "yes", "no", False, "noise"), Statement("cheap", "", "not measured", None)),
+        requirements=(CheckedStatement("fast", "≤ 1 s", "0.5 s", True),),
+        claims=(
+            CheckedStatement("stable", "yes", "no", False, "noise"),
+            CheckedStatement("cheap", "", "not measured", None),
+        ),
         paper=(PaperResult(2, "PID", "MAE [m]", 0.1, 0.1, "reproduces", True),),
     )
 
@@ -117,11 +120,11 @@ def test_what_cannot_be_read_is_one_clear_error(
 
 def test_a_missing_file_names_the_remedy(tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match=r"cannot be read .*run `dvc repro`"):
-        Standing.read(tmp_path)
+        CaseStanding.read(tmp_path)
 
 
 def test_standing_gate_and_card_say_what_the_file_says(validation: Validation, write: Callable[[Any], Path]) -> None:
-    standing = Standing.read(write(validation.to_json()).parent)
+    standing = CaseStanding.read(write(validation.to_json()).parent)
     assert [(law.law, law.lock_ups, law.ratio) for law in standing.laws] == [("inc", 4, 0.5), ("pid", 0, 1.5)]
     assert standing.reproduced == (1, 1)
     gate = Gate.of(validation, "inc")

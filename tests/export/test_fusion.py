@@ -21,9 +21,9 @@ from shipped_files import SHIPPED
 from loopwright.pipeline.export import fusion
 from loopwright.pipeline.export.fusion import emission, fused, reading
 from loopwright.pipeline.export.fusion.affine import Affine
-from loopwright.pipeline.export.fusion.plan import Choice, Item
-from loopwright.pipeline.export.fusion.pools import Group, Selection
-from loopwright.pipeline.export.fusion.reading import Reading
+from loopwright.pipeline.export.fusion.plan import FormChoice, Item
+from loopwright.pipeline.export.fusion.pools import Group, SelectionPool
+from loopwright.pipeline.export.fusion.reading import GraphReading
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 WITHOUT_QP = [p for p in SHIPPED if p.stem != "predictive"]
@@ -112,16 +112,16 @@ def test_any_graph_stays_what_it_is(model: onnx.ModelProto) -> None:
 
 def dependences(item: Item) -> list[Item]:
     """All that an item may use, whatever is chosen."""
-    if isinstance(item, Choice):
+    if isinstance(item, FormChoice):
         return list(item.forms.values())
     if isinstance(item, Group):
         return [item.flat(b) for v in item.values.values() if v.affine is not None for b in v.affine.parts]
-    return [item.source] if isinstance(item, Selection) else list(item.uses)
+    return [item.source] if isinstance(item, SelectionPool) else list(item.uses)
 
 
 def cyclic(model: onnx.ModelProto) -> bool:
     """Whether some choice of forms could make a value depend on itself."""
-    _, outputs = fusion.listed(Reading(model, factors=True))
+    _, outputs = fusion.listed(GraphReading(model, factors=True))
     done: set[int] = set()
     open_: set[int] = set()
     stack = [(item, False) for _, item in outputs if isinstance(item, Item)]

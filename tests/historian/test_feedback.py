@@ -9,7 +9,7 @@ import pytest
 from closed_loop_records import LOOPS, OperatedLoop
 from dirty_plant import START_S, screen, write
 
-from loopwright.pipeline.historian.cleaning.grid import resampled
+from loopwright.pipeline.historian.cleaning.row_grid import resampled
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.feedback import fed_back, follows
 from loopwright.pipeline.historian.files.export import Series

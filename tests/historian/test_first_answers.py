@@ -9,7 +9,7 @@ import pytest
 from dirty_plant import PERIOD_S, Clean, clean, screen_of, steps
 
 from loopwright.pipeline.historian.answers import first_answer
-from loopwright.pipeline.historian.cleaning.findings import Verdict
+from loopwright.pipeline.historian.cleaning.findings import RecordJudgement
 from loopwright.pipeline.report.screening import sayings
 
 N, DEAD, FIRST = 4000, 3, 4  # u(k-3) acts on y(k+1)
@@ -106,5 +106,5 @@ def test_a_late_column_is_no_feedback(tmp_path: Path) -> None:
     ("noise", "words"), [(0.1, "first answer after 18 s,"), (2.0, " to 18 s,"), (6.0, " s at most,")]
 )
 def test_a_range_is_printed_where_the_noise_hides_it(noise: float, words: str, tmp_path: Path) -> None:
-    verdict: Verdict = screen_of(clean(2500, noise=noise), tmp_path).report.verdict
+    verdict: RecordJudgement = screen_of(clean(2500, noise=noise), tmp_path).report.verdict
     assert words in sayings(verdict, {})[0]

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.cleaning import grid as grid_module
-from loopwright.pipeline.historian.cleaning.grid import resampled
+from loopwright.pipeline.historian.cleaning import row_grid as grid_module
+from loopwright.pipeline.historian.cleaning.row_grid import resampled
 from loopwright.pipeline.historian.cleaning.sampling import proposed_period, sampling
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.files.quality import Reason

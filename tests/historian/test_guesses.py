@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopwright.pipeline.historian.arx_model import fitted, lead
+from loopwright.pipeline.historian.arx_model import fit_arx, lead
 from loopwright.pipeline.historian.files.file_reader import read_export, units_of
 from loopwright.pipeline.historian.guessing import guesses
 
@@ -121,7 +121,7 @@ def test_an_mv_of_two_values_is_one(tmp_path: Path) -> None:
 def test_a_column_that_copies_an_mv_is_fitted(seed: int) -> None:
     """The fit is exact but for its ridge: once no row was left of it, and `new` ended without a table."""
     u = np.repeat(np.round(np.clip(np.random.default_rng(seed).normal(50, 15, 70), 5, 95), 1), 60)[:4000]
-    model = fitted(u, [u], np.zeros(len(u), dtype=np.int64))
+    model = fit_arx(u, [u], np.zeros(len(u), dtype=np.int64))
     assert model is not None
     assert lead(model, u, [u], 0)[0] > 1e3
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, cells, clean, screen, screen_of, steps, write
 
-from loopwright.pipeline.config.exports import ExportParams, Interval
+from loopwright.pipeline.config.exports import ExportParams, TimeSpan
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.screening import Screened
@@ -61,7 +61,7 @@ def test_days_are_left_out_to_their_end_and_a_time_without_rows_is_said(tmp_path
 )  # fmt: skip
 def test_what_is_no_interval_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match=r".+"):
-        Interval.of(text)
+        TimeSpan.of(text)
     with pytest.raises(ValueError, match=r".+"):
         ExportParams("tank", (Path("x.csv"),), (), leave_out=(text,))
 

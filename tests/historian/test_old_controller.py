@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from loopwright.pipeline.historian.cleaning.grid import Grid
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
 from loopwright.pipeline.historian.cleaning.tags import Tag
-from loopwright.pipeline.historian.old_loops import old_controllers
+from loopwright.pipeline.historian.old_loop_fit import old_controllers
 from loopwright.pipeline.records.old_loops import OldController
 
 H = 10.0  # s

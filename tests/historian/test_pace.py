@@ -21,8 +21,8 @@ from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.settling import (
     FINE,
     MOST_PERIODS,
-    Answer,
     Pace,
+    SettlingAnswer,
     _settling,
     in_words,
     of_period,
@@ -141,13 +141,13 @@ def test_sparse_fits_that_a_load_bends_leave_the_word_to_finer_ones() -> None:
     # (rows taken as one, whether the answer settles, rows that it takes); from a furnace of which 27 rows are dead time
     rows = [(1, True, 292.0), (3, True, 121.0), (10, True, 229.0), (30, True, 7.0), (100, True, 11.0)]
     assert _settling(rows) == (292.0, True)
-    assert Pace((Answer("pv0", "mv0", 584.0, shown=True),)).period(2.0) == 12.0
+    assert Pace((SettlingAnswer("pv0", "mv0", 584.0, shown=True),)).period(2.0) == 12.0
     # The same spread over a plant that its rows suit says nothing.
     assert _settling([(factor, kind, n / 5) for factor, kind, n in rows[:3]] + [(30, True, 9.0)]) == (0.0, False)
 
 
 def test_rows_that_show_a_long_settling_keep_their_step_and_the_remark_names_a_better_one() -> None:
-    answer = Answer("pv0", "mv0", 1600.0, shown=True)
+    answer = SettlingAnswer("pv0", "mv0", 1600.0, shown=True)
     found = Pace((answer,))
     assert found.period(10.0) == 10.0
     (finding,) = of_period(found, 10.0, 10.0, given=False)
@@ -162,7 +162,7 @@ def test_rows_that_show_a_long_settling_keep_their_step_and_the_remark_names_a_b
 @pytest.mark.parametrize("step_s", [0.04, 0.7, 1.0, 6.0, 7.5])
 @pytest.mark.parametrize("settles", [61, 100, 333, 1234, 50_000])
 def test_the_period_is_a_multiple_of_the_step_and_the_plant_settles_in_time(step_s: float, settles: int) -> None:
-    period = Pace((Answer("pv0", "mv0", settles * step_s, shown=False),)).period(step_s)
+    period = Pace((SettlingAnswer("pv0", "mv0", settles * step_s, shown=False),)).period(step_s)
     assert period / step_s == pytest.approx(round(period / step_s))
     assert 25 <= settles * step_s / period <= MOST_PERIODS + 1e-6
 

@@ -13,7 +13,7 @@ from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.cleaning.tags import Tag, named, write_tags
 from loopwright.pipeline.historian.files.file_reader import read_export
 from loopwright.pipeline.historian.guessing import guesses
-from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.screening import Screened, screen_export
 
 HEADER = ("timestamp", *(t.tag for t in TAGS))
 MODES = (Tag("A.MODE", "mode"), Tag("B.MODE", "mode"))
@@ -51,7 +51,7 @@ def test_a_tag_that_one_file_lacks_is_named_with_the_file(tmp_path: Path) -> Non
     rows = cells(clean())
     paths = [write(tmp_path / "p1.csv", rows[:900], HEADER)]
     paths += [write(tmp_path / "p2.csv", [row[:-1] for row in rows[900:]], HEADER[:-1])]
-    found = screened("plant", read_export(paths, [t.tag for t in TAGS]), named(TAGS))
+    found = screen_export("plant", read_export(paths, [t.tag for t in TAGS]), named(TAGS))
     (lacking,) = (f for f in found.report.findings if f.kind == "lacking")
     assert lacking.tag == "FI-7"
     assert lacking.words == f"{tmp_path / 'p2.csv'} has no FI-7: its 600 rows are left out"
@@ -61,7 +61,7 @@ def test_a_tag_that_one_file_lacks_is_named_with_the_file(tmp_path: Path) -> Non
 def test_files_of_other_tags_at_the_same_time_lack_nothing(tmp_path: Path) -> None:
     rows = cells(clean())
     paths = [write(tmp_path / f"{i}.csv", [[r[0], r[i]] for r in rows], (HEADER[0], HEADER[i])) for i in (1, 2, 3)]
-    found = screened("plant", read_export(paths, [t.tag for t in TAGS]), named(TAGS))
+    found = screen_export("plant", read_export(paths, [t.tag for t in TAGS]), named(TAGS))
     assert found.report.findings == ()
 
 

@@ -10,13 +10,13 @@ import pytest
 from dirty_plant import PERIOD_S, START_S, TAGS, Clean, answer, clean, screen_of, steps
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.cleaning.grid import resampled
+from loopwright.pipeline.historian.cleaning.row_grid import resampled
 from loopwright.pipeline.historian.cleaning.sampling import sampling
 from loopwright.pipeline.historian.cleaning.tags import Tag, named, read_tags
 from loopwright.pipeline.historian.export_params import exported, signal_tags
 from loopwright.pipeline.historian.files.export import Export, Series
 from loopwright.pipeline.historian.files.quality import Reason
-from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.screening import Screened, screen_export
 
 PV, MV, DV = TAGS
 LEVEL = Tag("TIC-101.PV", "pv", "m")
@@ -157,7 +157,7 @@ def test_a_compressed_pv_gets_rows_that_show_the_plant(share: float, seed: int) 
         "y": Series("y", t[kept], v[kept], np.zeros(len(kept), np.uint8)),
         "u": Series("u", t, u, np.zeros(len(t), np.uint8)),
     }
-    found = screened("x", Export(series, (), "wide", len(t), 0, 0), named((Tag("y", "pv"), Tag("u", "mv"))))
+    found = screen_export("x", Export(series, (), "wide", len(t), 0, 0), named((Tag("y", "pv"), Tag("u", "mv"))))
     assert not found.report.tags[0].sampling.dead_band
     assert found.report.period_s % 10.0 == 0
     assert found.report.period_s <= found.report.tags[0].sampling.step_s / 3
@@ -170,7 +170,7 @@ def test_cells_that_stay_empty_until_the_value_changes_are_held() -> None:
     same = np.r_[False, np.diff(u) == 0]
     code = np.where(same, np.uint8(Reason.EMPTY), np.uint8(0)).astype(np.uint8)
     series = {"y": Series("y", t, y, np.zeros(1200, np.uint8)), "u": Series("u", t, np.where(same, np.nan, u), code)}
-    found = screened("x", Export(series, (), "wide", 1200, 0, 0), named((Tag("y", "pv"), Tag("u", "mv"))))
+    found = screen_export("x", Export(series, (), "wide", 1200, 0, 0), named((Tag("y", "pv"), Tag("u", "mv"))))
     assert found.report.kept_rows > 1150
     np.testing.assert_array_equal(found.record.mv[:1000, 0], u[:1000])
 

@@ -10,7 +10,7 @@ from dirty_plant import PERIOD_S, TAGS, cells, clean, write
 
 from loopwright.pipeline.historian.cleaning.tags import named
 from loopwright.pipeline.historian.files.file_reader import read_export
-from loopwright.pipeline.historian.screening import Screened, screened
+from loopwright.pipeline.historian.screening import Screened, screen_export
 
 DATA = clean()
 N = len(DATA.pv)
@@ -20,7 +20,7 @@ MINUTES = cells(DATA.with_(time_s=np.floor(DATA.time_s / 60) * 60))
 
 def screen(*paths: Path) -> Screened:
     tags = named(TAGS)
-    return screened("plant", read_export(paths, [t.tag for t in tags]), tags)
+    return screen_export("plant", read_export(paths, [t.tag for t in tags]), tags)
 
 
 SENT: dict[str, tuple[list[list[list[str]]], int]] = {

@@ -13,7 +13,7 @@ from controller_fmus import MISSING, file_of
 from kits import ROOT
 
 from loopwright.pipeline.__main__ import main
-from loopwright.pipeline.commands import Parser
+from loopwright.pipeline.commands import OneLineParser
 from loopwright.pipeline.commands.fmu import options
 from loopwright.pipeline.hosts.fmu.compiling import HEADER, HOSTS, SHIPPED, SHIPPED_SHA256, SOURCES
 from loopwright.pipeline.hosts.fmu.folder import variables_of
@@ -122,7 +122,7 @@ def test_a_compiler_that_fails_is_one_line(tmp_path: Path, monkeypatch: pytest.M
 
 def test_the_page_names_every_option_and_variable() -> None:
     page = (ROOT / "docs" / "fmu.md").read_text()
-    parser = Parser()
+    parser = OneLineParser()
     options(parser)
     names = {name for action in parser._actions for name in action.option_strings} - {"-h", "--help"}
     assert names == {"--out", "--fmi", "--onnxruntime"}

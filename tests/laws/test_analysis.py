@@ -10,8 +10,8 @@ import pytest
 
 from loopwright.pipeline.cases import PLANTS
 from loopwright.pipeline.config.params import ControllerParams
-from loopwright.pipeline.evaluation.law_evidence import Analysis as Said
 from loopwright.pipeline.evaluation.law_evidence import Form, LawEvidence, LawMetrics
+from loopwright.pipeline.evaluation.law_evidence import FormAnalysis as Said
 from loopwright.pipeline.laws.base import Analysis
 from loopwright.pipeline.stages.design import _analysed
 from loopwright.pipeline.stages.paths import analysis_file

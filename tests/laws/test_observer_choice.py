@@ -13,7 +13,7 @@ from shipped import required
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws import LAWS, ControlLaw
-from loopwright.pipeline.laws.inverse.from_identified import CALM, CLEAR, Choice, linearized
+from loopwright.pipeline.laws.inverse.from_identified import CALM, CLEAR, HorizonChoice, linearized
 from loopwright.pipeline.laws.inverse.inverse_dob import ObserverLaw
 from loopwright.pipeline.laws.suitability import require_fit
 from loopwright.pipeline.models.identified.identified import Identified
@@ -40,8 +40,8 @@ def cascade(dead: int, noise: tuple[float, float] = (NOISE, NOISE)) -> Identifie
     return scaled_model(2, 1, 0, n, a=a, b=b, rest=rest, noise=np.array(noise), dead=np.array([float(dead)]))
 
 
-def chosen(model: Identified, signals: Signals = SIGNALS) -> Choice:
-    return Choice.of(model, signals, None, None)
+def chosen(model: Identified, signals: Signals = SIGNALS) -> HorizonChoice:
+    return HorizonChoice.of(model, signals, None, None)
 
 
 def designed(name: str, model: Identified, signals: Signals = SIGNALS, **params: Any) -> ObserverLaw:

@@ -29,15 +29,15 @@ from loopwright.pipeline.laws.predictive.observer import (
     OUTLIER,
     RISE,
     SWINGS,
-    Estimate,
     Noises,
     Observer,
+    StateEstimate,
     load_variance,
 )
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
-from loopwright.pipeline.laws.predictive.tuning import FORGETS, TRAVEL, Candidate, calmest, judged, searched, tuned
-from loopwright.pipeline.laws.predictive.tuning_loops import LOOPS, Outcome, Trials, _late, side_by_side
+from loopwright.pipeline.laws.predictive.tuning import FORGETS, TRAVEL, TriedNumbers, calmest, judged, searched, tuned
+from loopwright.pipeline.laws.predictive.tuning_loops import LOOPS, LoopErrors, TuningLoops, _late, side_by_side
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.plants.noise import noise_and_change
@@ -176,7 +176,9 @@ def test_the_filter_is_the_textbook_s_on_a_linear_model(seed: int, where: Where)
     mean, p, drift, square, signed = np.zeros(n_a), observer.first.numpy(), np.zeros(2), np.zeros(2), np.zeros(2)
     assert p[4, 4] == FIRST_LOAD**2
     none = torch.zeros(1, 2, dtype=torch.float64)
-    found = Estimate(torch.zeros(1, n_a, dtype=torch.float64), observer.first, none, torch.cat([none, none], dim=-1))
+    found = StateEstimate(
+        torch.zeros(1, n_a, dtype=torch.float64), observer.first, none, torch.cat([none, none], dim=-1)
+    )
     for k in range(30):
         y, v = 0.02 * rng.normal(size=2) + (k > 15), rng.normal(size=2)
         mean, p = f @ mean + b @ v + c, f @ p @ f.T + q
@@ -210,7 +212,7 @@ def test_the_covariance_goes_by_the_jacobian_of_the_network(where: Where) -> Non
         return torch.cat([model(torch.cat([x, v + loads.into_v @ d])) + loads.into_x @ d, d])
 
     f = torch.autograd.functional.jacobian(run, z).numpy()
-    past = Estimate(z[None], observer.first, row(0.0)[None], row(0.0, 0.0)[None])
+    past = StateEstimate(z[None], observer.first, row(0.0)[None], row(0.0, 0.0)[None])
     mean, covariance = observer.predicted(v[None], past)
     torch.testing.assert_close(mean[0], run(z))
     np.testing.assert_allclose(covariance, f @ observer.first.numpy() @ f.T + observer.q.numpy(), rtol=1e-9, atol=1e-12)
@@ -232,7 +234,7 @@ def test_a_load_at_the_mv_has_begun_when_it_shows() -> None:
 def test_innovations_of_both_signs_are_no_load(alternating: bool) -> None:
     model = first_order(pole=0.5)
     observer = Observer(model, loads_of(model, "outputs", 12), Noises(0.01, 1e-5))
-    past = Estimate(row(0.0, 0.0)[None], observer.first, row(0.0)[None], row(0.0, 0.0)[None])
+    past = StateEstimate(row(0.0, 0.0)[None], observer.first, row(0.0)[None], row(0.0, 0.0)[None])
     boosts = []
     for k in range(40):
         size = 0.2 * (-1.0 if alternating and k // 4 % 2 else 1.0)
@@ -385,9 +387,9 @@ class Bowl:
 
     best = row(2.0, 0.4, 0.3, 26.0)
 
-    def run(self, laws: Numbered, count: int) -> Outcome:
+    def run(self, laws: Numbered, count: int) -> LoopErrors:
         error = 1 + (laws.logs.reshape(count, 4) - self.best.log()).square().sum(dim=-1, keepdim=True).numpy()
-        return Outcome(error.repeat(LOOPS, axis=1), error.repeat(LOOPS, axis=1), np.zeros((count, 2)))
+        return LoopErrors(error.repeat(LOOPS, axis=1), error.repeat(LOOPS, axis=1), np.zeros((count, 2)))
 
 
 def test_the_search_takes_what_costs_least() -> None:
@@ -402,7 +404,7 @@ def test_the_search_takes_what_costs_least() -> None:
 def test_of_numbers_that_err_nearly_the_same_the_calmest_are_taken() -> None:
     """Their travel counts once, by its size, and not in the limit."""
     rows = ((1.0, 3.0), (1.04, 1.0), (1.049, 2.0), (1.06, 0.1))
-    made = [Candidate({}, error + TRAVEL * travel, travel=travel) for error, travel in rows]
+    made = [TriedNumbers({}, error + TRAVEL * travel, travel=travel) for error, travel in rows]
     assert [c.error for c in made] == pytest.approx([error for error, _ in rows])
     assert calmest(made) is made[1]
 
@@ -468,7 +470,7 @@ def test_a_disturbance_without_noise_needs_no_level() -> None:
 
 
 def test_the_noise_of_disturbances_is_in_the_trials() -> None:
-    quiet, noisy = (Trials.draw(noisy_disturbance(sd), made_signals(n_dv=1), 15, seed=0) for sd in (0.0, 0.2))
+    quiet, noisy = (TuningLoops.draw(noisy_disturbance(sd), made_signals(n_dv=1), 15, seed=0) for sd in (0.0, 0.2))
     assert not quiet.dv_noise.any()
     assert float(noisy.dv_noise.std()) == pytest.approx(0.2, rel=0.1)
     assert torch.equal(quiet.noise, noisy.noise)
@@ -484,7 +486,7 @@ def test_the_loads_of_a_record_go_on_in_the_loops() -> None:
         {**model.config(), "recorded": len(moves)},
         {name: value.numpy() for name, value in model.state_dict().items()} | {"load_moves": moves},
     )
-    plain, drawn = (Trials.draw(of, made_signals(), 15, seed=0) for of in (model, known))
+    plain, drawn = (TuningLoops.draw(of, made_signals(), 15, seed=0) for of in (model, known))
     load, quiet = drawn.load[..., 0].numpy(), drawn.quiet
     assert not plain.load[:, :LOOPS].any()
     assert not load[:quiet].any()
@@ -536,7 +538,7 @@ def test_a_law_that_calms_at_its_last_numbers_alone_is_damped_more() -> None:
 def test_trials_see_a_difference_grow() -> None:
     """The law forgets one; a law that turns over with every thousandth of the PV does not."""
     model, signals = first_order(pole=0.9), made_signals()
-    trials = Trials.draw(model, signals, 12, seed=1)
+    trials = TuningLoops.draw(model, signals, 12, seed=1)
     assert trials.growth(law_of(model, horizon=12)) < FORGETS
 
     class Sawtooth(torch.nn.Module):
@@ -551,8 +553,10 @@ def test_trials_see_a_difference_grow() -> None:
 def test_the_cost_weighs_relative_errors_and_travel() -> None:
     even = np.full((2, LOOPS), 2.0)
     uneven = np.array([[2.0] * LOOPS, [2.0] * (LOOPS - 1) + [8.0]])
-    given = Outcome(even[:1], even[:1], np.zeros((1, 2)))
-    found = judged(Outcome(even, uneven, np.array([[0.0, 0.0], [2.0, 4.0]])), given, [{"speed": 1.0}, {"speed": 2.0}])
+    given = LoopErrors(even[:1], even[:1], np.zeros((1, 2)))
+    found = judged(
+        LoopErrors(even, uneven, np.array([[0.0, 0.0], [2.0, 4.0]])), given, [{"speed": 1.0}, {"speed": 2.0}]
+    )
     assert found[0].cost == 1.0
     assert found[1].cost == pytest.approx(0.5 + 0.5 * 3.0 / 2.0 + 3 * TRAVEL)
     assert found[1].row() == {"speed": 2.0, "set_points": 1.0, "loads": 1.5, "travel": 3.0, "cost": found[1].cost}
@@ -561,7 +565,7 @@ def test_the_cost_weighs_relative_errors_and_travel() -> None:
 def test_laws_side_by_side_are_the_laws() -> None:
     model = random_model(4, n_y=2, n_mv=2)
     laws = [law_of(model, horizon=10, moves=3, speed=s, caution=c) for s, c in ((1.0, 1.0), (2.0, 0.5), (0.5, 4.0))]
-    trials = Trials.draw(model, laws[0].signals, 10, seed=1)
+    trials = TuningLoops.draw(model, laws[0].signals, 10, seed=1)
     together = trials.run(side_by_side(laws), 3)
     for i, law in enumerate(laws):
         alone = trials.run(law, 1)
@@ -573,7 +577,7 @@ def test_laws_side_by_side_are_the_laws() -> None:
 def test_trials_tell_a_good_law_from_a_sluggish_one_and_are_the_same_again() -> None:
     model = first_order(pole=0.9)
     signals, law = made_signals(), law_of(model, horizon=12)
-    trials, again = (Trials.draw(model, signals, 12, seed=1) for _ in range(2))
+    trials, again = (TuningLoops.draw(model, signals, 12, seed=1) for _ in range(2))
     good = trials.run(law, 1)
     np.testing.assert_array_equal(good.set_points, again.run(law, 1).set_points)
     slow, cautious = (law_of(model, horizon=12, **n) for n in ({"speed": 0.02}, {"caution": 1e4}))
@@ -584,13 +588,13 @@ def test_trials_tell_a_good_law_from_a_sluggish_one_and_are_the_same_again() -> 
 def test_set_points_of_trials_are_within_reach_of_their_own_plants() -> None:
     """Also under a gain that is too low; those of a level, which has no rest, lie within its record."""
     model = first_order(pole=0.9, gain=2.0)
-    trials = Trials.draw(model, made_signals(), 30, seed=0)
+    trials = TuningLoops.draw(model, made_signals(), 30, seed=0)
     error = trials.run(law_of(model, horizon=30), 1)
     assert error.set_points.max() < 4.0
     assert trials.sp.abs().max() < 2.0
     level = first_order(pole=0.9)
     level.a[0, 0], level.b[0, 0] = 1.0, 0.05
-    drawn = Trials.draw(level, made_signals(), 20, seed=0).sp[:, :LOOPS]
+    drawn = TuningLoops.draw(level, made_signals(), 20, seed=0).sp[:, :LOOPS]
     assert drawn.std() > 0.5
     assert drawn.abs().max() <= 1.5
 
@@ -599,7 +603,7 @@ def test_a_level_beside_an_output_that_rests_leaves_it_its_set_points() -> None:
     """y0 is a level filled by u0, y1 = u1 at rest, behind a lag: the set points of y1 are MVs within reach."""
     a, b = np.diag([1.0, 0.8]), np.diag([0.1, 0.2])
     model = scaled_model(2, 2, 0, 2, a=a, b=b, rest=np.eye(2, 5))
-    sp = Trials.draw(model, made_signals(2, 2), 15, seed=0).sp[:, :LOOPS]
+    sp = TuningLoops.draw(model, made_signals(2, 2), 15, seed=0).sp[:, :LOOPS]
     assert sp[..., 0].std() > 0.5
     assert sp[..., 1].std() > 0.3
     assert sp[..., 1].abs().max() <= 0.8
@@ -622,13 +626,13 @@ def test_a_searched_law_costs_no_more_than_the_given_one() -> None:
 
 def test_plants_of_the_trials_err_as_far_as_the_record_leaves_open_and_no_less_than_plants_change() -> None:
     model, signals = first_order(), made_signals()
-    certain = Trials.draw(model, signals, 12, seed=0)
+    certain = TuningLoops.draw(model, signals, 12, seed=0)
     assert certain.gain[:3, 0].tolist() == pytest.approx([1.0, 1.25, 0.8])
     assert certain.pace[:3, 0].tolist() == pytest.approx([1.0, 1 / 1.15, 1.15])
     assert certain.late[:3, 0].tolist() == [0.0, 0.5, 0.0]
     for name, sd in (("gain_sd", 0.2), ("pace_sd", 0.3)):
         getattr(model, name)[:] = sd
-    open_to = Trials.draw(model, signals, 12, seed=0)
+    open_to = TuningLoops.draw(model, signals, 12, seed=0)
     assert open_to.gain[1, 0] == pytest.approx(1.4)
     assert open_to.pace[2, 0] == pytest.approx(1.6)
 
@@ -652,7 +656,7 @@ def test_errors_of_dead_time_go_beyond_a_sample() -> None:
     for sd, latest in ((0.1, 0.5), (1.5, 3.0), (40.0, 5.0)):
         open_to = model.state_dict() | {"dead_sd": torch.tensor([sd]).double()}
         known = Identified.from_arrays(model.config(), {name: value.numpy() for name, value in open_to.items()})
-        trials = Trials.draw(known, made_signals(), 20, seed=0)
+        trials = TuningLoops.draw(known, made_signals(), 20, seed=0)
         assert float(trials.late.max()) == latest
         farthest = trials.late[:, 0] > 0.5
         assert farthest.sum() == 2 * (latest > 0.5)
@@ -665,7 +669,7 @@ def test_errors_of_pace_leave_a_stable_plant_stable() -> None:
     """A state that swings from sample to sample would grow under x + 1.15 (F(x) - x); larger models have such ones."""
     a, b = np.array([[0.9, 0.02], [0.0, -0.95]]), np.array([[0.1], [0.5]])
     model = scaled_model(1, 1, 0, 2, a=a, b=b, rest=np.eye(2, 3))
-    trials = Trials.draw(model, made_signals(), 15, seed=0)
+    trials = TuningLoops.draw(model, made_signals(), 15, seed=0)
     outcome = trials.run(law_of(model, horizon=15), 1)
     assert max(outcome.set_points.max(), outcome.loads.max()) < 10.0
 
@@ -673,7 +677,7 @@ def test_errors_of_pace_leave_a_stable_plant_stable() -> None:
 def test_errors_of_pace_leave_alone_what_only_remembers() -> None:
     """y is the MV of two samples ago, whatever the pace: the state between holds the MV, and not a share of it."""
     a, b = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-    trials = Trials.draw(scaled_model(1, 1, 0, 2, a=a, b=b, rest=np.eye(2, 3)), made_signals(), 15, seed=0)
+    trials = TuningLoops.draw(scaled_model(1, 1, 0, 2, a=a, b=b, rest=np.eye(2, 3)), made_signals(), 15, seed=0)
     x, v = torch.rand(2 * LOOPS, 2).double(), torch.rand(2 * LOOPS, 1).double()
     ahead = trials.ahead(x, v)
     assert ahead[:, 0].tolist() == x[:, 1].tolist()
@@ -683,7 +687,7 @@ def test_errors_of_pace_leave_alone_what_only_remembers() -> None:
 def test_noise_of_the_trials_has_the_colour_and_the_strength_of_the_model_s() -> None:
     model = first_order()
     model.noise[:], model.colour[:] = 0.02, 0.75
-    noise = Trials.draw(model, made_signals(), 60, seed=0).noise[..., 0].numpy()
+    noise = TuningLoops.draw(model, made_signals(), 60, seed=0).noise[..., 0].numpy()
     assert noise.std() == pytest.approx(0.04, rel=0.05)
     assert np.corrcoef(noise[1:, 0], noise[:-1, 0])[0, 1] == pytest.approx(0.75, abs=0.1)
 

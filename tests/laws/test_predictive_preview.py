@@ -13,7 +13,7 @@ from predictive_loops import closed, law_of, row
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.set_points import SetPoints
+from loopwright.pipeline.laws.predictive.set_points import SetPointCourse
 
 SMALL = {"horizon": 12, "moves": 5}
 changes = st.floats(-1, 1)
@@ -22,7 +22,7 @@ changes = st.floats(-1, 1)
 @given(now=changes, change=changes, before=changes)
 @settings(max_examples=50, deadline=None)
 def test_a_recipe_goes_on_with_the_smaller_of_its_last_slopes(now: float, change: float, before: float) -> None:
-    recipe = SetPoints(4, 1, (row(-2.0), row(1.5)), ramp=True)
+    recipe = SetPointCourse(4, 1, (row(-2.0), row(1.5)), ramp=True)
     past = [row(now - change)[None], row(now - change - before)[None]]
     found = recipe(row(now)[None], past)[0].numpy()
     slope = np.sign(change) * min(abs(change), abs(before)) if change * before > 0 else 0.0
@@ -30,10 +30,10 @@ def test_a_recipe_goes_on_with_the_smaller_of_its_last_slopes(now: float, change
 
 
 def test_several_set_points_have_slopes_of_their_own() -> None:
-    recipe = SetPoints(3, 2, None, ramp=True)
+    recipe = SetPointCourse(3, 2, None, ramp=True)
     found = recipe(row(1.0, 5.0)[None], [row(0.9, 5.2)[None], row(0.8, 5.4)[None]])
     np.testing.assert_allclose(found.reshape(3, 2), [[1.1, 4.8], [1.2, 4.6], [1.3, 4.4]])
-    held = SetPoints(3, 2, None, ramp=False)(row(1.0, 5.0)[None], [])
+    held = SetPointCourse(3, 2, None, ramp=False)(row(1.0, 5.0)[None], [])
     np.testing.assert_array_equal(held.reshape(3, 2), [[1.0, 5.0]] * 3)
 
 

@@ -15,9 +15,9 @@ from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.models.training.fit import LBFGS, TRAINERS, Adam, LevenbergMarquardt
 from loopwright.pipeline.models.training.objectives import (
+    FreeRunWindows,
     Objective,
     Samples,
-    Windows,
     input_jacobian,
     parameter_jacobian,
     scaled_output,
@@ -42,12 +42,12 @@ def eq_15(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return z, u
 
 
-def eq_15_windows(n: int, seed: int, steps: int, noise: float = 0.0) -> Windows:
+def eq_15_windows(n: int, seed: int, steps: int, noise: float = 0.0) -> FreeRunWindows:
     z, u = eq_15(n, seed)
     y = z + noise * np.random.default_rng(seed + 100).normal(size=n)
     k = np.arange(1, n - steps)
     index = k[:, None] + np.arange(steps)
-    return Windows(y[k - 1, None], u[index - 1][:, :, None], y[index])
+    return FreeRunWindows(y[k - 1, None], u[index - 1][:, :, None], y[index])
 
 
 def sine(n: int = 300, noise: float = 0.0, seed: int = 0) -> Samples:
@@ -95,7 +95,7 @@ def free_run() -> tuple[MLP, Objective]:
     model.net.reset(torch.Generator().manual_seed(0))
     model.net.y_scale.fill_(0.3)
     shapes = (30, 2), (30, 5, 2), (30, 4)
-    return model.net, Windows(*(rng.normal(size=s) for s in shapes))
+    return model.net, FreeRunWindows(*(rng.normal(size=s) for s in shapes))
 
 
 @pytest.mark.parametrize("make", [weighted_samples, free_run])
@@ -113,7 +113,7 @@ def test_normal_equations_equal_autograd(make, chunk: int) -> None:
 
 def test_free_run_jacobian_equals_autograd() -> None:
     net, objective = free_run()
-    assert isinstance(objective, Windows)
+    assert isinstance(objective, FreeRunWindows)
     past, u, future = (torch.from_numpy(a) for a in (objective.past, objective.u, objective.future))
     root = objective.future.size**-0.5 / net.y_scale
     names, values = zip(*net.named_parameters(), strict=True)

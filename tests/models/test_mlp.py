@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models import MODELS, load_model
-from loopwright.pipeline.models.local.local_models import Linearized
+from loopwright.pipeline.models.local.local_models import LinearizedPlant
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.plants.equations import EquationPlant
 
@@ -131,7 +131,7 @@ def test_reset_is_reproducible_and_spreads_the_units() -> None:
         (lambda: MLP.scaled_to(np.ones((5, 2)), np.arange(5.0)[:, None]), "input column 0"),
         (lambda: MLP.scaled_to(np.arange(5.0)[:, None], np.full((5, 1), np.nan)), "output column 0"),
         (lambda: MLP.scaled_to(np.arange(5.0), np.arange(5.0)), "shapes"),
-        (lambda: Linearized(2, 1, 0, 0.5), "n_pv=0"),
+        (lambda: LinearizedPlant(2, 1, 0, 0.5), "n_pv=0"),
     ],
 )
 def test_wrong_arguments_are_one_clear_line(make, says: str) -> None:
@@ -141,7 +141,7 @@ def test_wrong_arguments_are_one_clear_line(make, says: str) -> None:
 
 
 def test_linearized_keeps_the_steady_state_and_the_plant_s_slope(plant: EquationPlant, tmp_path: Path) -> None:
-    model = Linearized.at_set_point(plant, 0.66612814)
+    model = LinearizedPlant.at_set_point(plant, 0.66612814)
     x0 = torch.cat([model.x, model.mv])
     torch.testing.assert_close(model(x0), model.pv, rtol=1e-12, atol=1e-12)
     step = plant.stepper()

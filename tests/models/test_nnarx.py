@@ -16,9 +16,9 @@ from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import ModelError, ParamsError, RecordError
 from loopwright.pipeline.models import load_model
 from loopwright.pipeline.models.lagged.lagged import NNARX
-from loopwright.pipeline.models.lagged.nnarx_part import Candidate, NnarxPart, parsimonious
+from loopwright.pipeline.models.lagged.nnarx_part import NnarxPart, SizeCandidate, parsimonious
 from loopwright.pipeline.models.part import Source
-from loopwright.pipeline.models.training.objectives import Windows, regressor
+from loopwright.pipeline.models.training.objectives import FreeRunWindows, regressor
 from loopwright.pipeline.models.training.regressors import longest_run, nnarx_pairs, split_in_time
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.manifest import Signal
@@ -71,7 +71,7 @@ def test_a_free_run_equals_a_plain_loop(n_y: int, n_u: int, delay: int, steps: i
 def test_one_step_windows_are_the_pairs() -> None:
     record = made_up_record()
     pairs = nnarx_pairs(record, 2, 3, delay=2)
-    cut = Windows.of(record, 2, 3, 1, delay=2)
+    cut = FreeRunWindows.of(record, 2, 3, 1, delay=2)
     phi = regressor(list(torch.from_numpy(cut.past).unbind(1)), torch.from_numpy(cut.u), 0, n_y=2, n_u=3)
     assert np.array_equal(phi.numpy(), pairs.x)
     assert np.array_equal(cut.future, pairs.y)
@@ -104,9 +104,9 @@ def test_wrong_arguments_are_one_clear_line() -> None:
     with pytest.raises(ModelError, match="7 regressor columns"):
         NNARX.scaled_to(np.zeros((5, 7)), np.zeros((5, 1)), n_y=2, n_u=2)
     with pytest.raises(RecordError):
-        Windows.of(made_up_record((4, 4)), 2, 2, 10)
+        FreeRunWindows.of(made_up_record((4, 4)), 2, 2, 10)
     with pytest.raises(ModelError, match="windows have shapes"):
-        Windows(np.zeros((3, 2)), np.zeros((4, 2, 1)), np.zeros((3, 1)))
+        FreeRunWindows(np.zeros((3, 2)), np.zeros((4, 2, 1)), np.zeros((3, 1)))
 
 
 def linear_record(plant: ThiosulfateCstr, runs: tuple[int, ...] = (800,), order: int = 1, noise: float = 0.0) -> Record:
@@ -157,8 +157,8 @@ def test_search_says_what_a_size_may_be() -> None:
         parse(NnarxPart, {"search": [{"n_y": 1}, {"n_x": 2}]}, "nnarx")
 
 
-def candidate(parameters: int, free_run_rmse: float) -> Candidate:
-    return Candidate(1, 1, (1,), parameters, 0.0, free_run_rmse)
+def candidate(parameters: int, free_run_rmse: float) -> SizeCandidate:
+    return SizeCandidate(1, 1, (1,), parameters, 0.0, free_run_rmse)
 
 
 @given(st.lists(st.tuples(st.integers(1, 5), st.floats(0.01, 10.0)), min_size=1, max_size=8))
@@ -209,9 +209,9 @@ def test_the_longest_run_and_no_more_than_asked() -> None:
 
 def test_models_of_other_lags_are_compared_over_the_same_windows() -> None:
     record = made_up_record()
-    wide, narrow = Windows.of(record, 3, 3, 4), Windows.of(record, 1, 1, 4, least_back=2)
+    wide, narrow = FreeRunWindows.of(record, 3, 3, 4), FreeRunWindows.of(record, 1, 1, 4, least_back=2)
     assert np.array_equal(wide.future, narrow.future)
     assert np.array_equal(wide.past[:, -1:], narrow.past)
     assert np.array_equal(wide.u[:, 2:], narrow.u)
-    few = Windows.of(record, 3, 3, 4, every=3)
+    few = FreeRunWindows.of(record, 3, 3, 4, every=3)
     assert np.array_equal(few.future, wide.future[::3])

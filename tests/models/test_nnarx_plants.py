@@ -13,7 +13,7 @@ from loopwright.pipeline.models import Learnt
 from loopwright.pipeline.models.lagged.lagged import NNARX
 from loopwright.pipeline.models.lagged.nnarx_part import NnarxPart
 from loopwright.pipeline.models.part import Source, predict
-from loopwright.pipeline.models.training.objectives import Windows
+from loopwright.pipeline.models.training.objectives import FreeRunWindows
 from loopwright.pipeline.models.training.regressors import nnarx_pairs
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.records.record import Record
@@ -27,12 +27,12 @@ def tank() -> EquationPlant:
 
 
 @pytest.fixture(scope="module")
-def unseen(tank: EquationPlant) -> Windows:
+def unseen(tank: EquationPlant) -> FreeRunWindows:
     """Free runs over 30 samples of an experiment without noise that no network has seen."""
-    return Windows.of(EXCITATIONS["random_steps"](samples=800, hold=8).run(tank, 99), 2, 2, 30)
+    return FreeRunWindows.of(EXCITATIONS["random_steps"](samples=800, hold=8).run(tank, 99), 2, 2, 30)
 
 
-def free_run(learnt: Learnt, windows: Windows) -> float:
+def free_run(learnt: Learnt, windows: FreeRunWindows) -> float:
     assert isinstance(learnt.model, NNARX)
     with torch.no_grad():
         return float(windows.loss(learnt.model.net).sqrt() * learnt.model.net.y_scale)
@@ -46,7 +46,7 @@ def one_step(learnt: Learnt, record: Record) -> float:
 
 @pytest.mark.parametrize(("noise", "ahead", "free"), [((), 0.002, 0.0045), ((0.05,), 0.06, 0.021)])
 def test_training_on_free_runs_makes_free_runs_better(
-    tank: EquationPlant, unseen: Windows, noise: tuple[float, ...], ahead: float, free: float
+    tank: EquationPlant, unseen: FreeRunWindows, noise: tuple[float, ...], ahead: float, free: float
 ) -> None:
     """Reference, 2,000 points every 15 s: one step .0012; free run .0044 -> .0033, with noise .0190 -> .0117."""
     rows = []

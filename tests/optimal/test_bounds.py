@@ -31,7 +31,7 @@ from loopwright.pipeline.optimal.bounds import (
     stored_bounds,
     together,
 )
-from loopwright.pipeline.optimal.horizon import Horizon, Plan
+from loopwright.pipeline.optimal.nmpc_horizon import Horizon, NmpcPlan
 from loopwright.pipeline.optimal.perfect import run_offline
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.stages import bounds as bounds_stage
@@ -106,7 +106,7 @@ def test_an_optimum_is_no_worse_than_the_nmpc_and_says_that_it_did_not_converge(
     """On another plant every long plan failed, and the best rollout was stored as the optimum."""
     case, solve, path = LongTail(), Horizon.solve, tmp_path / "long.json"
 
-    def gives_up(self: Horizon, *given: Any) -> Plan:
+    def gives_up(self: Horizon, *given: Any) -> NmpcPlan:
         plan = solve(self, *given)
         return plan if self.n == case.effort.periods else replace(plan, solved=False)
 

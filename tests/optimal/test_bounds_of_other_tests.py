@@ -21,7 +21,7 @@ from loopwright.pipeline.evaluation.case import Array, Case, Effort
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
 from loopwright.pipeline.optimal.bounds import plant_digest
-from loopwright.pipeline.optimal.horizon import Horizon
+from loopwright.pipeline.optimal.nmpc_horizon import Horizon
 from loopwright.pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.simulation.scenario import Scenario, held

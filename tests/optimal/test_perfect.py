@@ -16,7 +16,7 @@ from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.evaluation.case import Case, Effort
 from loopwright.pipeline.evaluation.metric import METRICS
 from loopwright.pipeline.metrics import mae
-from loopwright.pipeline.optimal.horizon import Horizon
+from loopwright.pipeline.optimal.nmpc_horizon import Horizon
 from loopwright.pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline, search
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.simulation.scenario import Scenario

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from loopwright.pipeline.historian.files.time_stamps import UNSTATED, Clock, clock_of, zone_of
+from loopwright.pipeline.historian.files.time_stamps import UNSTATED, TimeForm, clock_of, zone_of
 from loopwright.pipeline.pictures.screening_pictures import ExportTimes
 
 START_S = datetime(2024, 3, 4, 6, tzinfo=UTC).timestamp()
@@ -36,9 +36,9 @@ def test_the_zone_is_what_the_stamps_say(name: str, cells: list[str], zone: str)
 
 def test_stamps_of_a_typed_file_may_have_a_zone() -> None:
     stamp = datetime(2024, 3, 4, 6)
-    assert zone_of(Clock("iso"), [None, stamp]) == zone_of(Clock("iso"), [date(2024, 3, 4)]) == UNSTATED
-    assert zone_of(Clock("iso"), [stamp.replace(tzinfo=UTC)]) == "UTC"
-    assert zone_of(Clock("iso"), []) == ""
+    assert zone_of(TimeForm("iso"), [None, stamp]) == zone_of(TimeForm("iso"), [date(2024, 3, 4)]) == UNSTATED
+    assert zone_of(TimeForm("iso"), [stamp.replace(tzinfo=UTC)]) == "UTC"
+    assert zone_of(TimeForm("iso"), []) == ""
 
 
 def test_an_export_with_dates_has_them_at_its_axis() -> None:

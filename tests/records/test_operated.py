@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.pipeline.historian.cleaning.grid import Grid
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
 from loopwright.pipeline.historian.cleaning.tags import Tag
-from loopwright.pipeline.historian.old_loops import old_controllers, operated
+from loopwright.pipeline.historian.old_loop_fit import old_controllers, operated
 from loopwright.pipeline.records.old_loops import operation
 
 SP = np.array([10.0, 10.0, 10.0, 12.0, 12.0, 12.0])

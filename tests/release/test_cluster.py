@@ -37,7 +37,7 @@ from loopwright.pipeline.engine.cluster import (
 )
 from loopwright.pipeline.engine.fingerprint import fingerprint
 from loopwright.pipeline.engine.parallel import _answers, parallel_map
-from loopwright.pipeline.engine.pieces import Task
+from loopwright.pipeline.engine.pieces import WorkerTask
 from loopwright.pipeline.errors import PipelineError
 
 # Dask closes some of its sockets only as it is collected.
@@ -88,7 +88,7 @@ def test_no_profiler_watches_a_task_however_its_worker_was_started(address: str)
 
 def test_a_piece_shares_its_work_in_turn_and_stays_in_its_folder(address: str) -> None:
     """More pieces at a time than there are workers: each waits for its own."""
-    given = Task({"given.txt": b"7"}, lambda: True)
+    given = WorkerTask({"given.txt": b"7"}, lambda: True)
     items = range(12)
     alone = [sum(k**2 for k in range(i)) + 7 for i in items]
     client = connected(address)

@@ -27,7 +27,7 @@ from loopwright.pipeline.hosts.fmu.folder import (
 )
 from loopwright.pipeline.hosts.fmu.gate import check, problems
 from loopwright.serving import Controller
-from loopwright.serving.conformance.steps import Answer, answered
+from loopwright.serving.conformance.steps import StepResult, answered
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)
@@ -62,7 +62,7 @@ def state_of(u: Unit, of: str) -> bytes:
 
 
 # ------------------------------------------------------------------ the same bits
-def compared(controller: Controller, answers: list[Answer], u: Unit) -> Counter[str]:
+def compared(controller: Controller, answers: list[StepResult], u: Unit) -> Counter[str]:
     """Play a kit's steps; how many gave numbers ("") and how many were refused, and because of what."""
     n, seen = controller.manifest.n_state, Counter[str]()
     groups = [group for group in controller.manifest.inputs if group != "state"]

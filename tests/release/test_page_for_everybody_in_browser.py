@@ -15,7 +15,7 @@ import pytest
 from chromium import CHROMIUM, come_in
 from fake_loop import BEGIN, FakeLoop
 
-from loopwright.serving.journal import Event
+from loopwright.serving.journal import EventEntry
 from loopwright.serving.monitor.verdicts import when
 
 if CHROMIUM is None:
@@ -315,7 +315,7 @@ def test_every_time_on_the_page_is_in_the_zone_of_its_clock(
     since = when(BEGIN)
     verdict = {"name": "u moves", "level": "watch", "text": f"u is at its end since {since}, and the error stays"}
     loop.state["verdicts"] = [verdict]
-    loop.writer.event(Event(BEGIN, "monitor", "monitor", f"u moves: watch: {verdict['text']}"))
+    loop.writer.event(EventEntry(BEGIN, "monitor", "monitor", f"u moves: watch: {verdict['text']}"))
     there = datetime.fromtimestamp(BEGIN, ZoneInfo("Asia/Kolkata"))
     page = come_in(browser, served, timezone_id="Asia/Kolkata")
     for said in (page.locator("#verdicts .what"), page.locator("#events .what", has_text="u moves")):

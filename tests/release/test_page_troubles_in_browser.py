@@ -8,7 +8,7 @@ import pytest
 from chromium import CHROMIUM
 from fake_loop import BEGIN, THIRDS, FakeLoop
 
-from loopwright.serving.journal import Event, Scan
+from loopwright.serving.journal import EventEntry, ScanEntry
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
@@ -116,7 +116,7 @@ def test_the_focus_stays_on_its_alarm_while_news_come_in(page: Page, loop: FakeL
     held = "document.activeElement.closest('[data-id]')?.dataset.id"
     before = page.evaluate(held)
     count = page.locator("#alarm-list .alarm").count()
-    loop.writer.event(Event(BEGIN + 90, "alarm", "loop", "another", alarm="other", raised=True))
+    loop.writer.event(EventEntry(BEGIN + 90, "alarm", "loop", "another", alarm="other", raised=True))
     expect(page.locator("#alarm-list .alarm")).to_have_count(count + 1)
     assert before is not None
     assert page.evaluate(held) == before
@@ -128,9 +128,9 @@ def test_each_alarm_that_is_over_is_shown_as_over(page: Page, loop: FakeLoop) ->
 
     for name in ("first", "second", "third"):
         at = page.locator("#alarm-list .alarm", has_text=f"valve {name}")
-        loop.writer.event(Event(BEGIN + 91, "alarm", "loop", f"valve {name}", alarm="valve", raised=True))
+        loop.writer.event(EventEntry(BEGIN + 91, "alarm", "loop", f"valve {name}", alarm="valve", raised=True))
         expect(at).to_have_attribute("data-level", "active")
-        loop.writer.event(Event(BEGIN + 92, "alarm", "loop", "over", alarm="valve"))
+        loop.writer.event(EventEntry(BEGIN + 92, "alarm", "loop", "over", alarm="valve"))
         expect(at).to_have_attribute("data-level", "past-unseen")
     assert [what for what in stand("past-unseen") if "valve" in what] == ["valve third", "valve second", "valve first"]
     expect(page.locator("#events")).to_contain_text("the alarm is over")
@@ -148,7 +148,7 @@ def test_the_trend_goes_on_when_the_loops_clock_is_set_back(page: Page, loop: Fa
     loop.state |= {"time": BEGIN + 60, "reason": "the clock is set"}
     expect(page.locator("#reason")).to_contain_text("the clock is set")
     for k in range(5):
-        loop.writer.scan(Scan(BEGIN + 49.5 + k, "AUTO", (0.5,) * loop.columns))
+        loop.writer.scan(ScanEntry(BEGIN + 49.5 + k, "AUTO", (0.5,) * loop.columns))
     expect(chart).to_have_attribute("data-rows", str(61 + 5))
 
 

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.errors import PipelineError
-from loopwright.pipeline.evaluation.leaderboard import Standing, tally
+from loopwright.pipeline.evaluation.leaderboard import CaseStanding, tally
 from loopwright.pipeline.evaluation.validation import SCHEMA
 from loopwright.pipeline.report import templating
 from loopwright.pipeline.report.overview import write_overview
@@ -93,8 +93,8 @@ def artifacts(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def standings(artifacts: Path) -> list[Standing]:
-    return [Standing.read(artifacts / name) for name in ("tank", "reactor")]
+def standings(artifacts: Path) -> list[CaseStanding]:
+    return [CaseStanding.read(artifacts / name) for name in ("tank", "reactor")]
 
 
 def test_a_standing_is_what_programs_were_told(artifacts: Path) -> None:
@@ -114,7 +114,7 @@ def test_where_noise_would_hide_the_bound_the_ratio_is_to_what_it_hides(tmp_path
     tree = a_case("tank", "mae", 1e-8, {"alpha": 0.03, "beta": 1e-5}, floor=0.02)
     (tmp_path / "tank").mkdir()
     (tmp_path / "tank" / "validation.json").write_text(json.dumps(tree))
-    standing = Standing.read(tmp_path / "tank")
+    standing = CaseStanding.read(tmp_path / "tank")
     assert (standing.bound, standing.hidden) == (1e-8, True)
     assert [law.ratio for law in standing.laws] == pytest.approx([1.0, 1.5])
     text = "\n".join(shown(tmp_path))
@@ -233,7 +233,7 @@ def test_what_cannot_be_read_is_one_clear_error(artifacts: Path, tmp_path: Path)
         show_results(tmp_path / "none")
     (artifacts / "tank" / "validation.json").write_text('{"scenarios": {}}')
     with pytest.raises(PipelineError, match=r"tank.validation\.json has schema None.*dvc repro"):
-        Standing.read(artifacts / "tank")
+        CaseStanding.read(artifacts / "tank")
 
 
 def test_the_overview_needs_no_heavy_import() -> None:

@@ -12,7 +12,7 @@ from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.evaluation.closed_loop import FAR
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
-from loopwright.pipeline.evaluation.validation import Statement
+from loopwright.pipeline.evaluation.validation import CheckedStatement
 from loopwright.pipeline.evaluation.verdicts import PLAIN
 from loopwright.pipeline.report.own_acceptance import (
     against,
@@ -54,7 +54,7 @@ def evidence(best: LawEvidence, pid: LawEvidence | None) -> Evidence:
     return Evidence(case, bounds, laws, {}, own_data=True)
 
 
-def row(found: Evidence, words: str) -> Statement:
+def row(found: Evidence, words: str) -> CheckedStatement:
     (one,) = [r for r in own_acceptance(found) if words in r.what]
     return one
 

@@ -20,7 +20,7 @@ from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatch
 from loopwright.pipeline.errors import ReportError
 from loopwright.pipeline.evaluation.case import Array, Case, Requirement
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.evaluation.law_evidence import Analysis
+from loopwright.pipeline.evaluation.law_evidence import FormAnalysis
 from loopwright.pipeline.evaluation.metric import Metric
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.evaluation.verdicts import PLAIN
@@ -238,5 +238,5 @@ def test_arrays_of_an_analysis_belong_to_a_form(root: Path) -> None:
     assert law.analysis_arrays({})["radius"].tolist() == [1.0, 1.0, 1.0]
     assert law.analysis_arrays({"gain": 2})["radius"].tolist() == [0.0, 0.0]
     assert law.analysis_arrays({"gain": 3}) == {}
-    assert law.analyses["gain=2"] == Analysis({"radius": 1.02}, ("Stable around each point.",))
+    assert law.analyses["gain=2"] == FormAnalysis({"radius": 1.02}, ("Stable around each point.",))
     assert law.form({"gain": 3}) is None

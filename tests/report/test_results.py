@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from loopwright.pipeline.evaluation.leaderboard import Standing
+from loopwright.pipeline.evaluation.leaderboard import CaseStanding
 from loopwright.pipeline.report.results import AHEAD, show_results
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
@@ -21,6 +21,6 @@ def test_a_ratio_below_the_bound_has_a_remark_and_no_other(monkeypatch: pytest.M
         monkeypatch.setattr("loopwright.pipeline.report.results.AHEAD", ahead)
         show_results(ARTIFACTS, Console(file=(terminal := io.StringIO()), width=200))
         said[ahead] = "below 1" in terminal.getvalue()
-    standings = [Standing.read(path.parent) for path in ARTIFACTS.glob("*/validation.json")]
+    standings = [CaseStanding.read(path.parent) for path in ARTIFACTS.glob("*/validation.json")]
     ratios = [law.ratio for of in standings for law in of.laws if of.times == "× NMPC"]
     assert said == {AHEAD: min(r for r in ratios if r is not None) < AHEAD, 0.0: False, 1e9: True}

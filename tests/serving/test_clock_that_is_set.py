@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from loopwright.serving import Controller
-from loopwright.serving.journal import Journal, JournalReader, Scan, columns
+from loopwright.serving.journal import Journal, JournalReader, ScanEntry, columns
 from loopwright.serving.page.trend import trend
 from loopwright.serving.station.journal_export import export
 
@@ -35,7 +35,7 @@ def reader(tmp_path: Path, controller: Controller) -> Iterator[JournalReader]:
     with closing(Journal(tmp_path / "loop.journal")) as journal:
         journal.begin(controller.manifest, controller.sha256, BEGIN)
         for k, time_s in enumerate(clock()):
-            journal.scan(Scan(time_s, "HOLD" if k in HOLD else "AUTO", (float(k),) * width))
+            journal.scan(ScanEntry(time_s, "HOLD" if k in HOLD else "AUTO", (float(k),) * width))
     with closing(JournalReader(tmp_path / "loop.journal")) as made:
         yield made
 

@@ -13,7 +13,7 @@ import pytest
 from loopwright.serving.errors import LoopError
 from loopwright.serving.journal import Journal
 from loopwright.serving.journal.file import LockTakenError, locked
-from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.mv_lock import Lease
 
 NODE, ENDPOINT = "ns=2;s=MV.u", "opc.tcp://127.0.0.1:4841"
 

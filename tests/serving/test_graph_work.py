@@ -7,19 +7,19 @@ from typing import Any
 
 import pytest
 
-from loopwright.serving.graph.work import BOOL, DOUBLE, INT64, MAX_RANK, Node, Value, results
+from loopwright.serving.graph.work import BOOL, DOUBLE, INT64, MAX_RANK, Node, TensorValue, results
 
 
-def tensor(*shape: int, dtype: int = DOUBLE) -> Value:
-    return Value(shape, dtype)
+def tensor(*shape: int, dtype: int = DOUBLE) -> TensorValue:
+    return TensorValue(shape, dtype)
 
 
-def numbers(*values: int) -> Value:
+def numbers(*values: int) -> TensorValue:
     """A constant of int64."""
-    return Value((len(values),), INT64, struct.pack(f"<{len(values)}q", *values))
+    return TensorValue((len(values),), INT64, struct.pack(f"<{len(values)}q", *values))
 
 
-def node(op: str, *inputs: Value | None, n_out: int = 1, **attributes: Any) -> Node:
+def node(op: str, *inputs: TensorValue | None, n_out: int = 1, **attributes: Any) -> Node:
     return Node(op, inputs, attributes, n_out)
 
 

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from loopwright.pipeline.__main__ import main
-from loopwright.serving.journal import Event, Journal
+from loopwright.serving.journal import EventEntry, Journal
 
 BEGIN = 1_772_323_200.0  # 2026-03-01 00:00 UTC
 EVENTS = [
-    Event(BEGIN, "change", "loop", "loop.toml: started in SHADOW"),
-    Event(BEGIN + 3600, "change", "anna", "mode SHADOW -> AUTO", "handed over"),
-    Event(BEGIN + 3661, "fault", "loop", "PV T: bad,\nand more", "", "fault", True),
-    Event(BEGIN + 3700, "acknowledged", "anna", "PV T: bad", "cleaned", about=3),
+    EventEntry(BEGIN, "change", "loop", "loop.toml: started in SHADOW"),
+    EventEntry(BEGIN + 3600, "change", "anna", "mode SHADOW -> AUTO", "handed over"),
+    EventEntry(BEGIN + 3661, "fault", "loop", "PV T: bad,\nand more", "", "fault", True),
+    EventEntry(BEGIN + 3700, "acknowledged", "anna", "PV T: bad", "cleaned", about=3),
 ]
 
 

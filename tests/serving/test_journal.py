@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from processes import within
 
 from loopwright.serving import Controller, LoopError
-from loopwright.serving.journal import Event, Journal, JournalReader, Scan, columns, writer
+from loopwright.serving.journal import EventEntry, Journal, JournalReader, ScanEntry, columns, writer
 from loopwright.serving.journal.entries import EVENT, Kind, packed, unpacked
 from loopwright.serving.journal.file import TABLES
 from loopwright.serving.journal.writer import BLOCK, FRESH, LEAST_EVENTS, SLACK, shorten_events
@@ -32,17 +32,19 @@ from loopwright.serving.station.recorder import Recorder
 pytest_plugins = ["small_laws"]
 
 
-def scans(n: int, seed: int = 0, width: int = 9) -> list[Scan]:
+def scans(n: int, seed: int = 0, width: int = 9) -> list[ScanEntry]:
     rng = np.random.default_rng(seed)
     found = []
     for k in range(n):
         numbers = tuple(np.where(rng.random(width) < 0.1, np.nan, rng.normal(size=width)).tolist())
         quality = (0, 2147483648) if k % 50 == 3 else ()
-        found.append(Scan(1e9 + k, ("AUTO", "HOLD")[k % 97 > 90], numbers, quality, "PV level: bad" * (k % 50 == 3)))
+        found.append(
+            ScanEntry(1e9 + k, ("AUTO", "HOLD")[k % 97 > 90], numbers, quality, "PV level: bad" * (k % 50 == 3))
+        )
     return found
 
 
-def same(a: Scan, b: Scan) -> bool:
+def same(a: ScanEntry, b: ScanEntry) -> bool:
     return np.array_equal(a.numbers, b.numbers, equal_nan=True) and (a.time_s, a.mode, a.quality, a.reason) == (
         b.time_s, b.mode, b.quality, b.reason,
     )  # fmt: skip
@@ -54,13 +56,13 @@ def test_what_is_written_is_read_also_after_it_was_packed(tmp_path: Path, contro
     journal.begin(controller.manifest, controller.sha256, 1e9)
     for scan in given:
         journal.scan(scan)
-    journal.event(Event(1e9, "change", "anna", "mode AUTO", "start of the shift"))
+    journal.event(EventEntry(1e9, "change", "anna", "mode AUTO", "start of the shift"))
     journal.close()
     reader = JournalReader(tmp_path / "loop.journal")
     found = list(reader.scans())
     assert [id_ for id_, _, _ in found] == list(range(1, len(given) + 1))
     assert all(same(a, b) for a, (_, _, b) in zip(given, found, strict=True))
-    assert reader.events() == [(1, Event(1e9, "change", "anna", "mode AUTO", "start of the shift"))]
+    assert reader.events() == [(1, EventEntry(1e9, "change", "anna", "mode AUTO", "start of the shift"))]
     (run,) = reader.runs()
     assert run["columns"] == columns(controller.manifest)
     assert run["columns"][:4] == ["sp level", "pv level", "pv T", "mv valve"]
@@ -116,10 +118,10 @@ def test_events_are_bounded_and_no_alarm_is_lost_that_somebody_has_yet_to_see(
 ) -> None:
     path = tmp_path / "loop.journal"
 
-    def event(k: int, kind: Kind, what: str, **more: Any) -> Event:
-        return Event(1e9 + k, kind, "loop", what, "", **more)
+    def event(k: int, kind: Kind, what: str, **more: Any) -> EventEntry:
+        return EventEntry(1e9 + k, kind, "loop", what, "", **more)
 
-    def written(events: list[Event]) -> None:
+    def written(events: list[EventEntry]) -> None:
         journal = Journal(path, max_mb=1.0)
         for e in events:
             journal.event(e)
@@ -214,7 +216,7 @@ def test_runs_that_alternate_lose_nothing_when_they_are_packed(tmp_path: Path, c
     base.commit()
     base.close()
     journal = Journal(path)
-    journal.event(Event(1e9, "change", "anna", "mode AUTO"))
+    journal.event(EventEntry(1e9, "change", "anna", "mode AUTO"))
     journal.close()
     reader = JournalReader(path)
     found = list(reader.scans())
@@ -308,7 +310,7 @@ def test_what_a_full_disk_costs_is_said_and_no_run_is_lost(
 
     monkeypatch.setattr(journal, "_write", sometimes)
     journal.begin(controller.manifest, controller.sha256, 1e9)
-    journal.event(Event(1e9, "fault", "loop", "PV T: bad", alarm="fault", raised=True))
+    journal.event(EventEntry(1e9, "fault", "loop", "PV T: bad", alarm="fault", raised=True))
     given = scans(50)
     for scan in given:
         journal.scan(scan)
@@ -456,7 +458,7 @@ def test_a_file_that_goes_while_it_is_written_is_made_again_with_its_rows(
 
 
 def written(
-    path: Path, controller: Controller, given: list[Scan], tell: Callable[[str], None] = lambda _: None
+    path: Path, controller: Controller, given: list[ScanEntry], tell: Callable[[str], None] = lambda _: None
 ) -> Journal:
     """An open journal that holds some scans more."""
     journal = Journal(path, tell=tell)
@@ -664,7 +666,7 @@ def test_what_a_disk_that_is_full_at_the_end_costs_is_counted(
         journal.path.unlink()
     for scan in scans(45):
         journal.scan(scan)
-    journal.event(Event(1e9, "change", "loop", "ended"))
+    journal.event(EventEntry(1e9, "change", "loop", "ended"))
     journal.keep("monitor", "learnt")
     journal.close()
     assert journal.lost == lost

@@ -11,7 +11,7 @@ import pytest
 
 from loopwright.pipeline.historian.cleaning.tags import read_tags
 from loopwright.serving import Controller, Signal
-from loopwright.serving.journal import Journal, Scan, columns
+from loopwright.serving.journal import Journal, ScanEntry, columns
 from loopwright.serving.station.journal_export import export, tag_table
 
 pytest_plugins = ["small_laws"]
@@ -24,7 +24,7 @@ def test_times_are_the_plants_and_runs_follow_each_other(tmp_path: Path, control
         journal.begin(m, controller.sha256, began, speed)
         for k in range(40):
             when = began + k * m.period_s / speed
-            journal.scan(Scan(when, "AUTO", tuple(map(float, range(width))), reason=""))
+            journal.scan(ScanEntry(when, "AUTO", tuple(map(float, range(width))), reason=""))
     journal.close()
     assert export(tmp_path / "loop.journal", tmp_path / "loop.csv") == 120
     tag_table(tmp_path / "loop.journal", tmp_path / "tags.csv")
@@ -52,7 +52,7 @@ def test_the_mv_of_a_row_is_the_one_that_acts_after_its_pv(tmp_path: Path, contr
         journal.begin(m, controller.sha256, began, 1.0)
         for k in (0, 1, 2, 5, 6):  # two scans were lost
             own = {mv: 10.0 + k, back: 9.0 + k if read_back else np.nan, pv: float(k)}
-            journal.scan(Scan(began + k * m.period_s, "AUTO", tuple(own.get(n, 0.0) for n in names), reason=""))
+            journal.scan(ScanEntry(began + k * m.period_s, "AUTO", tuple(own.get(n, 0.0) for n in names), reason=""))
     journal.close()
     export(tmp_path / "loop.journal", tmp_path / "loop.csv")
     table = pd.read_csv(tmp_path / "loop.csv")
@@ -69,7 +69,7 @@ def test_an_actuator_that_does_not_follow_is_believed(tmp_path: Path, controller
     for k in range(3):
         own = {mv: 50.0, back: float(k)}
         numbers = tuple(own.get(name, 0.0) for name in columns(m))
-        journal.scan(Scan(1e9 + k * m.period_s, "AUTO", numbers, reason=""))
+        journal.scan(ScanEntry(1e9 + k * m.period_s, "AUTO", numbers, reason=""))
     journal.close()
     export(tmp_path / "loop.journal", tmp_path / "loop.csv")
     assert pd.read_csv(tmp_path / "loop.csv")[f"{m.mv[0].name}.OP"].tolist() == [1, 2, 50]
@@ -111,7 +111,7 @@ def test_what_was_not_measured_is_an_empty_cell(
     journal.begin(controller.manifest, controller.sha256, 1e9, 1.0)
     for k in range(3):
         numbers = tuple(np.nan if name.startswith("mv ") else 0.0 for name in names)
-        journal.scan(Scan(1e9 + 0.5 * k, "HOLD", numbers, quality, reason))
+        journal.scan(ScanEntry(1e9 + 0.5 * k, "HOLD", numbers, quality, reason))
     journal.close()
     export(tmp_path / "loop.journal", tmp_path / "loop.csv")
     table = pd.read_csv(tmp_path / "loop.csv").drop(columns=["time", "MODE"])
@@ -125,7 +125,7 @@ def test_of_dvs_that_are_not_all_read_none_is_believed_where_one_is_bad(tmp_path
     journal.begin(m, "", 1e9, 1.0)
     for k, status in enumerate((0, BAD, 0)):  # two PVs, an MV, and one of the two DVs
         quality = (0, 0, 0, status)
-        journal.scan(Scan(1e9 + 0.5 * k, "AUTO", (0.5,) * len(columns(m)), quality, ""))
+        journal.scan(ScanEntry(1e9 + 0.5 * k, "AUTO", (0.5,) * len(columns(m)), quality, ""))
     journal.close()
     export(tmp_path / "loop.journal", tmp_path / "loop.csv")
     table = pd.read_csv(tmp_path / "loop.csv")

@@ -16,12 +16,12 @@ from processes import within
 from loopwright.serving import Controller
 from loopwright.serving.errors import EndpointError, LoopError
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
-from loopwright.serving.opcua.lease import SeveralLeasesError, beside
 from loopwright.serving.opcua.limits import OperationLimits, Pieces, TooManyError, in_pieces
 from loopwright.serving.opcua.link import Link, node_id
-from loopwright.serving.opcua.plan import Plan
+from loopwright.serving.opcua.node_lease import SeveralLeasesError, beside
+from loopwright.serving.opcua.plan import NodePlan
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import LateError, Reading, in_time
+from loopwright.serving.opcua.values import LateError, NodeReading, in_time
 
 pytest_plugins = ["small_laws"]
 
@@ -209,8 +209,8 @@ class Folders:
             raise self.fails
         return [ua.NodeId(n, 2) for n in self.leases if n.startswith(str(node.Identifier)[0])]
 
-    async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
-        return [Reading(float("nan"), 0, None, self.kind) for _ in nodes]
+    async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[NodeReading]:
+        return [NodeReading(float("nan"), 0, None, self.kind) for _ in nodes]
 
     async def values(self, nodes: Sequence[ua.NodeId], _: float, __: int) -> list[ua.DataValue]:
         return [ua.DataValue(ua.Variant(3, ua.VariantType.Byte)) for _ in nodes]
@@ -251,7 +251,7 @@ def test_what_is_written_as_an_mv_is_written_as_nothing_else(also: str, controll
             return [node_id(t, ["", "", "u"]) for t in texts]
 
     with pytest.raises(LoopError, match=f"MV a and {also} are one node, ns=2;s=a; give each its own"):
-        asyncio.run(Plan.made(Resolving(), manifest, nodes, 1.0))  # type: ignore[arg-type]
+        asyncio.run(NodePlan.made(Resolving(), manifest, nodes, 1.0))  # type: ignore[arg-type]
 
 
 def test_where_there_are_several_leases_nothing_is_written_and_all_is_read(controller: Controller) -> None:
@@ -259,18 +259,18 @@ def test_where_there_are_several_leases_nothing_is_written_and_all_is_read(contr
         async def resolved(self, texts: Sequence[str], _: float) -> list[ua.NodeId]:
             return [node_id(t, []) for t in texts]
 
-        async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
+        async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[NodeReading]:
             kinds = [self.kind if "lease" in str(n.Identifier) else ua.VariantType.Double for n in nodes]
-            return [Reading(1.0, 0, None, kind) for kind in kinds]
+            return [NodeReading(1.0, 0, None, kind) for kind in kinds]
 
     m = controller.manifest
     nodes = Nodes(**{g: {s.name: f"ns=2;s=a {s.name}" for s in m.signals(g)} for g in ("pv", "mv", "dv")})
-    plan = asyncio.run(Plan.made(Several("a lease", "a lease too"), m, nodes, 1.0))  # type: ignore[arg-type]
+    plan = asyncio.run(NodePlan.made(Several("a lease", "a lease too"), m, nodes, 1.0))  # type: ignore[arg-type]
     assert plan.lease is None
     assert plan.unwritable.startswith("lease: there are 2 nodes LoopwrightLease beside the MVs")
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
     endpoint: Any = OpcUaEndpoint(m, server, nodes, max_age_s=1.0)
-    endpoint._barred, endpoint._link, endpoint._told, endpoint._shown = plan.unwritable, object(), 1, 1
+    endpoint._barred, endpoint._link, endpoint._told_on, endpoint._shown_on = plan.unwritable, object(), 1, 1
     with pytest.raises(EndpointError, match="lease: there are 2 nodes"):
         endpoint.write([50.0])
     assert not endpoint._outbox

@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shipped_files import SHIPPED
 
-import loopwright.serving.grid
 import loopwright.serving.loop
+import loopwright.serving.scan_grid
 from loopwright.serving import (
     Command,
     Complete,
@@ -581,7 +581,7 @@ def test_a_clock_that_fails_holds_and_the_machines_own_measures_the_period(
     make_loop: Callable[..., ControlLoop], monkeypatch: Any, where: str
 ) -> None:
     spare = VirtualClock()
-    monkeypatch.setattr(loopwright.serving.grid, "MonotonicClock", lambda: spare)
+    monkeypatch.setattr(loopwright.serving.scan_grid, "MonotonicClock", lambda: spare)
     clock, tank, commands = VirtualClock(100.0), Tank(), []
 
     def raised(*_: Any) -> Any:
@@ -743,7 +743,7 @@ def test_every_written_mv_lies_in_range_and_the_run_never_raises(
     rate = tuple(data.draw(st.floats(1e-9, 1e9)) for _ in m.mv)
     n = 8
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loopwright.serving.grid, "MonotonicClock", VirtualClock)
+        patch.setattr(loopwright.serving.scan_grid, "MonotonicClock", VirtualClock)
         patch.setattr(controller, "step", chaos.step)
         patch.setattr(controller, "warm", chaos.warm)
         chaos.loop = ControlLoop(

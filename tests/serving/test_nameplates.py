@@ -19,10 +19,10 @@ from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.link import node_id
 from loopwright.serving.opcua.nameplates import ChangedNodeError, Nameplates, by_name, identity, others_since
-from loopwright.serving.opcua.plan import Plan
-from loopwright.serving.opcua.sampling import Ages, Sampling, Values
+from loopwright.serving.opcua.plan import NodePlan
+from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import ModeNode, Nodes, Point, Server
-from loopwright.serving.opcua.values import BusyError, LateError, Reading
+from loopwright.serving.opcua.values import BusyError, LateError, NodeReading
 from loopwright.serving.station.build_loop import keep_namespaces, keep_nodes, namespaces_before, nodes_before
 from loopwright.serving.station.requests import Wishes
 
@@ -55,8 +55,8 @@ class MadeUpLink:
     async def resolved(self, nodes: Sequence[str], _: float) -> list[ua.NodeId]:
         return [node_id(n, self.spaces) for n in nodes]
 
-    async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
-        return [Reading(1.0, 0, None, self.kinds.get(str(n.Identifier), DOUBLE)) for n in nodes]
+    async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[NodeReading]:
+        return [NodeReading(1.0, 0, None, self.kinds.get(str(n.Identifier), DOUBLE)) for n in nodes]
 
     async def browsed(
         self, nodes: Sequence[ua.NodeId], _: int, __: float, *, inverse: bool = False
@@ -99,12 +99,12 @@ def manifest(controller: Controller) -> Manifest:
     return controller.manifest
 
 
-def connected(link: Any, made: Nameplates) -> Plan:
+def connected(link: Any, made: Nameplates) -> NodePlan:
     """What the endpoint does at each connection."""
 
-    async def act() -> Plan:
+    async def act() -> NodePlan:
         await made.require_spaces(link, 1.0)
-        plan = await Plan.made(link, made.manifest, made.nodes, 1.0)
+        plan = await NodePlan.made(link, made.manifest, made.nodes, 1.0)
         await made.look(link, plan, 1.0)
         return plan
 
@@ -171,11 +171,11 @@ def test_what_a_number_stood_for_outlives_the_loop(manifest: Manifest, tmp_path:
     connected(MadeUpLink("urn:one"), after)
 
 
-def valued(made: Nameplates, plan: Plan, **kinds: ua.VariantType) -> Values:
+def valued(made: Nameplates, plan: NodePlan, **kinds: ua.VariantType) -> Values:
     """The values of a reading in which some nodes have another type."""
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
-    answers = [Reading(1.0, 0, None, kinds.get(row.name.replace(" ", "_"), DOUBLE)) for row in plan.rows]
-    sampling = Sampling(made.manifest, server, made.nodes, made)
+    answers = [NodeReading(1.0, 0, None, kinds.get(row.name.replace(" ", "_"), DOUBLE)) for row in plan.rows]
+    sampling = NodeSampling(made.manifest, server, made.nodes, made)
     return sampling.valued(plan, answers, Ages(len(plan.timed)), 0.0, unbeaten="", starts=0)
 
 
@@ -222,7 +222,7 @@ def test_an_mv_whose_written_node_is_another_one_is_not_written_and_its_sample_i
         assert made.fault == valued(made, plan).fault == ""
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
     endpoint = OpcUaEndpoint(manifest, server, made.nodes, max_age_s=1.0)
-    endpoint.nameplates, endpoint._link, endpoint._told, endpoint._shown = made, link, 1, 1  # type: ignore[assignment]
+    endpoint.nameplates, endpoint._link, endpoint._told_on, endpoint._shown_on = made, link, 1, 1  # type: ignore[assignment]
     with pytest.raises(EndpointError, match="MV valve, written: "):
         endpoint.write(np.array([50.0]))
     endpoint._outbox.append(np.array([50.0]))  # passed on before it was known

@@ -20,7 +20,7 @@ from fake_loop import BEGIN, Browser, FakeLoop, opened
 from processes import lives, within
 
 from loopwright.serving import Controller, LoopError
-from loopwright.serving.journal import Event, Journal, JournalReader, Scan
+from loopwright.serving.journal import EventEntry, Journal, JournalReader, ScanEntry
 from loopwright.serving.page.live import Live
 from loopwright.serving.page.process import PageProcess
 from loopwright.serving.page.settings import Page
@@ -377,7 +377,7 @@ def test_the_first_event_of_an_empty_journal_is_news(tmp_path: Path) -> None:
     with closing(Journal(tmp_path / "loop.journal")) as journal:
         live = Live(journal.path, lambda _: {})
         assert live._entries() == []  # what is there at first; here it is nothing
-        journal.event(Event(BEGIN, "change", "anna", "mode SHADOW -> AUTO"))
+        journal.event(EventEntry(BEGIN, "change", "anna", "mode SHADOW -> AUTO"))
         assert within(10, lambda: journal.behind == 0)
         (news,) = live._entries()
         assert "mode SHADOW -> AUTO" in news
@@ -409,7 +409,7 @@ def test_changes_of_mode_are_thinned_and_no_hold_is_lost(seed: int) -> None:
 def test_a_trend_of_a_loop_that_changes_its_mode_at_each_scan_is_short(tmp_path: Path, controller: Controller) -> None:
     made = FakeLoop(tmp_path, controller, scans=0)
     for k in range(20_000):
-        made.writer.scan(Scan(BEGIN + k, "AUTO" if k % 2 else "HOLD", (0.5,) * made.columns))
+        made.writer.scan(ScanEntry(BEGIN + k, "AUTO" if k % 2 else "HOLD", (0.5,) * made.columns))
     made.close()
     with closing(JournalReader(made.journal)) as reader:
         drawn = trend(reader, BEGIN, BEGIN + 20_000, 100)

@@ -20,7 +20,7 @@ from processes import within
 from served_plant import PERIOD_S, SPEED, begun, cut, mend, read, served, wired, write  # noqa: F401
 
 from loopwright.serving import Command, Mode
-from loopwright.serving.journal import Scan
+from loopwright.serving.journal import ScanEntry
 from loopwright.serving.mv_readback import SAME
 from loopwright.serving.opcua.certificates import make
 
@@ -71,7 +71,7 @@ def show(capsys: pytest.CaptureFixture[str], name: str, until_hold: int, until_a
         print(f"\n{name:28} HOLD after {until_hold:2} periods, AUTO {until_auto:3} after its end: {reason}")
 
 
-def in_flight(found: list[Scan]) -> set[float]:
+def in_flight(found: list[ScanEntry]) -> set[float]:
     """The MVs of the last scans before each HOLD."""
     mv = 1 + 2  # behind sp and pv
     falls = [i for i in range(2, len(found)) if found[i].mode == "HOLD" != found[i - 1].mode]
@@ -84,7 +84,7 @@ def stands(running: RunningLoop) -> bool:
     return all(c.mode is Mode.HOLD for c in last) and len({tuple(c.mv.tolist()) for c in last if c.writes}) <= 1
 
 
-def legal(found: list[Scan], plant: Plant, since: int, besides: set[float]) -> None:
+def legal(found: list[ScanEntry], plant: Plant, since: int, besides: set[float]) -> None:
     """What the MV node held since then, period by period: in range, and changed by nothing but fresh commands.
 
     A value that is new there was commanded within the last scans. While the loop holds, the node stands still. What

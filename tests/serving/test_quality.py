@@ -15,13 +15,13 @@ from asyncua import ua
 from loopwright.serving import Controller, EndpointError, Sample, VirtualClock
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
-from loopwright.serving.opcua.plan import Plan
-from loopwright.serving.opcua.sampling import Ages, Sampling, Values
+from loopwright.serving.opcua.plan import NodePlan
+from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import Reading
+from loopwright.serving.opcua.values import NodeReading
 from loopwright.serving.station import station
 from loopwright.serving.station.journal_export import export
-from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.settings import JournalSettings, Settings
 from loopwright.serving.station.station import Station
 from loopwright.serving.station.views import state
@@ -96,18 +96,18 @@ def test_an_answer_beside_the_scan_gives_its_quality_to_no_other_answers_values(
     assert table["T.PV"].isna().tolist() == [False] * 5 + [True]  # nothing was read at the last
 
 
-def valued(uncertain: Any, *readings: Reading) -> Values:
+def valued(uncertain: Any, *readings: NodeReading) -> Values:
     """What an endpoint makes of the answers to one request."""
     manifest = Controller(PID).manifest
     nodes = Nodes(**NODES)
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, uncertain=uncertain)
-    plan = Plan(nodes, manifest)
+    plan = NodePlan(nodes, manifest)
     ages = Ages(len(plan.timed))
-    return Sampling(manifest, server, nodes).valued(plan, list(readings), ages, 100.0, unbeaten="", starts=0)
+    return NodeSampling(manifest, server, nodes).valued(plan, list(readings), ages, 100.0, unbeaten="", starts=0)
 
 
-def reading(number: float, status: int = GOOD) -> Reading:
-    return Reading(number, status, None, ua.VariantType.Double)
+def reading(number: float, status: int = GOOD) -> NodeReading:
+    return NodeReading(number, status, None, ua.VariantType.Double)
 
 
 @pytest.mark.parametrize(

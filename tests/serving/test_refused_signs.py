@@ -15,7 +15,7 @@ from loopwright.serving import Controller, EndpointError
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.link import Link, node_id
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import LateError, Reading
+from loopwright.serving.opcua.values import LateError, NodeReading
 
 pytest_plugins = ["small_laws"]
 GOOD, REFUSED, MISMATCH = 0, ua.StatusCodes.BadNotWritable, ua.StatusCodes.BadTypeMismatch
@@ -48,7 +48,7 @@ class MadeUpLink:
     async def browsed(self, nodes: Sequence[ua.NodeId], _: int, __: float, *, inverse: bool = False) -> list[Any]:
         return [[] for _ in nodes]
 
-    async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[Reading]:
+    async def read(self, nodes: Sequence[ua.NodeId], _: float) -> list[NodeReading]:
         self.reads += 1
         if self.silent:
             raise LateError("it does not answer")
@@ -56,7 +56,7 @@ class MadeUpLink:
             raise EndpointError(self.fails)
         names = [n.to_string() for n in nodes]
         return [
-            Reading(1.0, 0, None, self.kinds.get(n, ua.VariantType.Double), "", self.held.get(n, "")) for n in names
+            NodeReading(1.0, 0, None, self.kinds.get(n, ua.VariantType.Double), "", self.held.get(n, "")) for n in names
         ]
 
     async def values(

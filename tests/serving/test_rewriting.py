@@ -11,7 +11,7 @@ import pytest
 
 from loopwright.serving import Controller, LoopError
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
-from loopwright.serving.opcua.sampling import Sampling
+from loopwright.serving.opcua.sampling import NodeSampling
 from loopwright.serving.opcua.settings import Nodes, Server
 
 pytest_plugins = ["small_laws"]
@@ -30,7 +30,7 @@ def endpoint(controller: Controller, rewrite_s: float, clock: Clock) -> OpcUaEnd
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, rewrite_s=rewrite_s)
     made = OpcUaEndpoint(m, server, Nodes(**nodes), max_age_s=1.0, clock=clock)
     made._link = object()  # type: ignore[assignment]
-    made._shown = made._told = 1  # it is known where the MV stands
+    made._shown_on = made._told_on = 1  # it is known where the MV stands
     return made
 
 
@@ -77,7 +77,7 @@ def test_a_time_that_is_none_is_refused() -> None:
 
 def test_a_watchdog_that_is_gone_has_stopped(controller: Controller) -> None:
     of = endpoint(controller, 2.0, Clock())
-    made = Sampling(of.manifest, of.server, replace(of.nodes, watchdog="ns=2;s=W", watchdog_scans=3))
+    made = NodeSampling(of.manifest, of.server, replace(of.nodes, watchdog="ns=2;s=W", watchdog_scans=3))
     assert [bool(made.dead(value)) for value in (1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 4.0, 5.0)] == [False] * 5 + [
         True,
         True,

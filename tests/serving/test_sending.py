@@ -37,7 +37,7 @@ class Plant:
     def reads(self) -> None:
         """An answer to a request of now."""
         self.reads_late()
-        self.endpoint._shown = 1
+        self.endpoint._shown_on = 1
 
     def reads_late(self) -> None:
         """An answer to a request of before the last write."""

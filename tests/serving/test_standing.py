@@ -23,7 +23,7 @@ from loopwright.serving import (
     Signal,
     VirtualClock,
 )
-from loopwright.serving.mv_readback import SAME, SETTLED, Standing
+from loopwright.serving.mv_readback import SAME, SETTLED, StandingMv
 
 pytest_plugins = ["small_laws"]
 RANGE = 100.0
@@ -348,7 +348,7 @@ def test_a_move_that_no_read_back_shows_yet_is_written_over(make_loop: Callable[
 
 def test_a_difference_of_rounding_is_no_offset() -> None:
     """Else the MV that a loop holds after a loss would differ from the plant's own in its last bits."""
-    standing = Standing((Signal("u", "%", 0.0, 100.0),), np.array([50.0]))
+    standing = StandingMv((Signal("u", "%", 0.0, 100.0),), np.array([50.0]))
     for _ in range(10):
         standing.commanded(np.array([50.0]), written=True)
         standing.seen(np.array([50.0 + 1e-13]))

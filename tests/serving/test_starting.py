@@ -26,7 +26,7 @@ from loopwright.serving.opcua.settings import Nodes, Server
 from loopwright.serving.station import station
 from loopwright.serving.station.build_loop import another_before, namespaces_before
 from loopwright.serving.station.command import _Lines
-from loopwright.serving.station.lease import Lease
+from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.settings import Hold, JournalSettings, Settings
 from loopwright.serving.station.station import Station
 from loopwright.serving.station.views import state

@@ -22,12 +22,12 @@ from processes import within
 from loopwright.pipeline.__main__ import main
 from loopwright.serving import Mode
 from loopwright.serving.errors import LoopError
-from loopwright.serving.opcua.lease import SCANS, NodeLease
 from loopwright.serving.opcua.nameplates import Identity
+from loopwright.serving.opcua.node_lease import SCANS, NodeLease
 from loopwright.serving.station import station
 from loopwright.serving.station.control import Control, ask, door
 from loopwright.serving.station.housekeeping import Tending
-from loopwright.serving.station.lease import Lease, Locks, address_of
+from loopwright.serving.station.mv_lock import Lease, Locks, address_of
 
 SPEED = 2.0  # periods of .25 s: a loop counts as gone after five without a renewal
 LEASE = f'lease = "{SPACE}Control.Lease"'

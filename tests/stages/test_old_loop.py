@@ -13,7 +13,7 @@ from rich.console import Console
 from undrawn import draw_nothing
 
 from loopwright.pipeline.evaluation.validation import Validation
-from loopwright.pipeline.records.record_file import SetPoints
+from loopwright.pipeline.records.record_file import RecordedSetPoints
 from loopwright.pipeline.report.results import show_results
 from loopwright.pipeline.stages.design import design
 from loopwright.pipeline.stages.report import report
@@ -34,7 +34,7 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def through_the_stages(pid: dict[str, object], old: dict[str, object], *, replayed: bool = False) -> Validation:
     case = controllers_of_a_lag({"pid": pid, "old_loop": old})
     if replayed:  # a set point that the PV crosses all the time
-        SetPoints(("y0",), np.full((len(case.record), 1), 0.1)).write(case.data)
+        RecordedSetPoints(("y0",), np.full((len(case.record), 1), 0.1)).write(case.data)
     for name in ("it-pid", "it-old_loop"):
         design(name)
         validate(name)

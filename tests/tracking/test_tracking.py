@@ -29,7 +29,7 @@ from loopwright.pipeline.files import sha256
 from loopwright.pipeline.tracking.gate import Gate
 from loopwright.pipeline.tracking.registry import REQUIREMENTS, versions
 from loopwright.pipeline.tracking.runs import publish
-from loopwright.pipeline.tracking.stage_results import StageResult, Times, dataset_hash, datasets, read_lock
+from loopwright.pipeline.tracking.stage_results import StageResult, StageTimes, dataset_hash, datasets, read_lock
 from loopwright.pipeline.tracking.store import store
 
 pytestmark = [
@@ -411,7 +411,7 @@ def test_a_stage_under_dvc_leaves_a_receipt_that_fits_its_files(tmp_path):
         assert done.returncode == status
     assert [p.name for p in (tmp_path / "receipts").iterdir()] == ["good.json"]  # none of a stage that failed
     (result,) = read_lock(tmp_path)
-    times = Times.of(result, tmp_path)
+    times = StageTimes.of(result, tmp_path)
     assert times.measured
     assert before * 1000 <= times.start_ms <= times.end_ms <= time.time() * 1000
 

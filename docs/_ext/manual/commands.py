@@ -6,7 +6,7 @@ import argparse
 import os
 from collections.abc import Iterator, Sequence
 
-from loopwright.pipeline.commands import COMMANDS, Parser, loaded
+from loopwright.pipeline.commands import COMMANDS, OneLineParser, loaded
 from manual.markdown import code, table
 
 Actions = argparse._SubParsersAction
@@ -14,7 +14,7 @@ Actions = argparse._SubParsersAction
 
 def parser_of(name: str) -> argparse.ArgumentParser:
     """The parser of one command, as ``loopwright NAME`` makes it."""
-    parser = Parser(prog=f"loopwright {name}", description=COMMANDS[name])
+    parser = OneLineParser(prog=f"loopwright {name}", description=COMMANDS[name])
     before = os.environ.get("LOGNAME")
     os.environ["LOGNAME"] = "you"  # a default that is the user's name
     try:

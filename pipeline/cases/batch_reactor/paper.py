@@ -11,7 +11,7 @@ from loopwright.pipeline.cases.batch_reactor.case import CALMED, PLAIN
 from loopwright.pipeline.evaluation.case import Curve, PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.words import law_name
 
@@ -32,7 +32,7 @@ def reason(row: PaperFigure, ours: float, evidence: Evidence) -> str:
     )
 
 
-def _ahead(evidence: Evidence) -> Outcome:
+def _ahead(evidence: Evidence) -> CheckOutcome:
     laws, late_s = ("linearized_pid", "recursive_pid"), evidence.late_s(TEST)
     errors = {law: [evidence.measured(law, NOISY, metric) for metric in ("sse", "sse_late")] for law in laws}
     measured = "; ".join(
@@ -40,14 +40,14 @@ def _ahead(evidence: Evidence) -> Outcome:
         for law, (sse, late) in errors.items()
     )
     holds = all(ours < other for ours, other in zip(*errors.values(), strict=True))
-    return Outcome(measured, holds, "both figures have to be lower; the start is out of every controller's reach")
+    return CheckOutcome(measured, holds, "both figures have to be lower; the start is out of every controller's reach")
 
 
-def _calm(evidence: Evidence) -> Outcome:
+def _calm(evidence: Evidence) -> CheckOutcome:
     """Travel of kc over the late part, as a multiple of its mean, without and with filter and update criterion."""
     plain, calm = (_travel(evidence, curve) for curve in (PLAIN, CALMED))
     measured = f"kc travels {number(plain)} times its mean without them, {number(calm)} times with them"
-    return Outcome(measured, calm < plain, f"on {NOISY}, from {evidence.late_s(TEST):g} s on")
+    return CheckOutcome(measured, calm < plain, f"on {NOISY}, from {evidence.late_s(TEST):g} s on")
 
 
 def _travel(evidence: Evidence, curve: Curve) -> float:

@@ -12,7 +12,7 @@ from loopwright.pipeline.cases.henson_seborg_cstr.case import ALONE, AUTO, FAST,
 from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.steady import Linearization
@@ -34,13 +34,13 @@ BOTH = (GAINS, AUTO)
 
 
 # ---------------------------------------------------------------- the paper's claims
-def _overshoot(evidence: Evidence) -> Outcome:
+def _overshoot(evidence: Evidence) -> CheckOutcome:
     last, most = (evidence.measured(GAINS, "up", f"overshoot_{which}") for which in ("last", "max"))
     measured = f"{100 * last:.1f} % of the step to 0.13 mol/l; up to {100 * most:.0f} % on the way"
-    return Outcome(measured, last <= SMALL, f"small is up to {100 * SMALL:g} %")
+    return CheckOutcome(measured, last <= SMALL, f"small is up to {100 * SMALL:g} %")
 
 
-def _accuracy(evidence: Evidence) -> Outcome:
+def _accuracy(evidence: Evidence) -> CheckOutcome:
     names = ("staircase.fit_C", "staircase.fit_T", "staircase.largest_error", "steady_error", "random.fit_C")
     fit_c, fit_t, largest, steady, drawn = (evidence.measured(SET, "", name) for name in names)
     measured = (
@@ -48,27 +48,27 @@ def _accuracy(evidence: Evidence) -> Outcome:
         f"{drawn:.1f} % (C); steady error between the points to {100 * steady:+.1f} %"
     )
     holds = min(fit_c, fit_t) >= HIGH_FIT and abs(steady) <= HIGH_STEADY
-    return Outcome(measured, holds, f"high is {HIGH_FIT:g} % and {100 * HIGH_STEADY:g} % of steady error")
+    return CheckOutcome(measured, holds, f"high is {HIGH_FIT:g} % and {100 * HIGH_STEADY:g} % of steady error")
 
 
-def _five(evidence: Evidence) -> Outcome:
+def _five(evidence: Evidence) -> CheckOutcome:
     fits = {int(n): float(v) for n, v in (evidence.part(SET, SET).get("sizes") or {}).items()}
     if 5 not in fits or len(fits) < 3:
         raise NotMeasuredError
     fewer, more = ([v for n, v in fits.items() if (n - 5) * side > 0] for side in (-1, 1))
     holds = bool(fewer and more) and fits[5] - max(fewer) > WORTH and max(more) - fits[5] < WORTH
     measured = "fit of C on the staircase " + ", ".join(f"{n}: {v:.1f} %" for n, v in sorted(fits.items()))
-    return Outcome(measured, holds, f"points at equal distances of q_c; {WORTH:g} % of fit are worth a model more")
+    return CheckOutcome(measured, holds, f"points at equal distances of q_c; {WORTH:g} % of fit are worth a model more")
 
 
-def _hopf(evidence: Evidence) -> Outcome:
+def _hopf(evidence: Evidence) -> CheckOutcome:
     plant = evidence.case.equations
     at = hopf_point(plant)
     measured = f"the eigenvalues cross the imaginary axis at C = {at[0]:.5f} mol/l, q_c = {at[1]:.2f} l/min"
     holds = all(abs(ours - printed) <= NEAR * printed for ours, printed in zip(at, PRINTED_HOPF, strict=True))
     stable = plant.linearize(*plant.steady_state_at(PRINTED_HOPF[0])).eigenvalues[0].real < 0
     because = f"within {100 * NEAR:g} %; the printed point is {'still a stable' if stable else 'an unstable'} one"
-    return Outcome(measured, holds, because)
+    return CheckOutcome(measured, holds, because)
 
 
 def hopf_point(plant: EquationPlant) -> tuple[float, float]:
@@ -101,13 +101,13 @@ def rekindling_flow(plant: EquationPlant) -> float:
     return float(optimize.minimize_scalar(flow, bounds=(of["T_f"] + 5.0, of["T_f"] + 40.0), method="bounded").fun)
 
 
-def _second_point(evidence: Evidence) -> Outcome:
+def _second_point(evidence: Evidence) -> CheckOutcome:
     ours = evidence.measured(SET, "", "operating_points.2.q_c")
     measured = f"q_c = {ours:.3f} l/min at T = 442 K, C as printed"
-    return Outcome(measured, abs(ours - PRINTED_QC_2) <= ROUNDED, "from the plant's own balances")
+    return CheckOutcome(measured, abs(ours - PRINTED_QC_2) <= ROUNDED, "from the plant's own balances")
 
 
-def _ahead(evidence: Evidence) -> Outcome:
+def _ahead(evidence: Evidence) -> CheckOutcome:
     errors = {test: [evidence.figure(c.law, test, "iae", c.setting) for c in (GAINS, PID_1)] for test in TESTS}
     measured = {
         test: (ours, single) for test, (ours, single) in errors.items() if ours is not None and single is not None
@@ -123,10 +123,10 @@ def _ahead(evidence: Evidence) -> Outcome:
         and (margin := evidence.figure(curve.law, "", "gain_margin", curve.setting)) is not None
     ]
     because = f"ahead on {', '.join(wins) or 'none'}" + (f"; on up, {', '.join(beside)}" if beside else "")
-    return Outcome(f"IAE network : PID 1 alone, {shown}", 2 * len(wins) > len(measured), because)
+    return CheckOutcome(f"IAE network : PID 1 alone, {shown}", 2 * len(wins) > len(measured), because)
 
 
-def _ziegler_nichols(evidence: Evidence) -> Outcome:
+def _ziegler_nichols(evidence: Evidence) -> CheckOutcome:
     """Whether proportional feedback has an ultimate gain on the local models, and what the sampling makes of it."""
     plant = evidence.case.equations
     points = (evidence.part(SET, SET).get("operating_points") or {}).values()
@@ -141,7 +141,7 @@ def _ziegler_nichols(evidence: Evidence) -> Outcome:
         else "some gain is unstable in continuous time"
     )
     because = f"only the sampling makes an ultimate gain: {', '.join(f'{k:,.0f}' for k in sampled)}"
-    return Outcome(measured, not stable, because)
+    return CheckOutcome(measured, not stable, because)
 
 
 def ultimate_gain(lin: Linearization, period_s: float) -> float:
@@ -155,10 +155,10 @@ def ultimate_gain(lin: Linearization, period_s: float) -> float:
 
 
 # ---------------------------------------------------------------- acceptance
-def _fits(evidence: Evidence) -> Outcome:
+def _fits(evidence: Evidence) -> CheckOutcome:
     fits = {name: evidence.measured(SET, "", f"staircase.{name}") for name in FITS}
     shown = ", ".join(f"{name[-1]} {v:.2f} %" for name, v in fits.items())
-    return Outcome(shown, all(fits[name] >= v for name, v in FITS.items()))
+    return CheckOutcome(shown, all(fits[name] >= v for name, v in FITS.items()))
 
 
 def _analyses(evidence: Evidence, figure: str, *curves: Curve) -> dict[str, float]:
@@ -166,25 +166,25 @@ def _analyses(evidence: Evidence, figure: str, *curves: Curve) -> dict[str, floa
     return {curve.law: evidence.measured(curve, "", figure) for curve in curves}
 
 
-def _radius(evidence: Evidence) -> Outcome:
+def _radius(evidence: Evidence) -> CheckOutcome:
     radii = _analyses(evidence, "frozen_radius", *BOTH)
-    return Outcome(", ".join(f"{law} {v:.4f}" for law, v in radii.items()), max(radii.values()) <= RADIUS)
+    return CheckOutcome(", ".join(f"{law} {v:.4f}" for law, v in radii.items()), max(radii.values()) <= RADIUS)
 
 
-def _pairs(evidence: Evidence) -> Outcome:
+def _pairs(evidence: Evidence) -> CheckOutcome:
     proved, pairs = (_analyses(evidence, figure, AUTO, GAINS) for figure in ("lyapunov_pairs", "neighbour_pairs"))
     shown = ", ".join(f"{law} {proved[law]:.0f} of {pairs[law]:.0f}" for law in pairs)
-    return Outcome(shown, proved[AUTO.law] == pairs[AUTO.law])
+    return CheckOutcome(shown, proved[AUTO.law] == pairs[AUTO.law])
 
 
-def _recovered(evidence: Evidence) -> Outcome:
+def _recovered(evidence: Evidence) -> CheckOutcome:
     recovered, starts, left = (_analyses(evidence, figure, *BOTH) for figure in ("recovered", "starts", "left_range"))
     shown = ", ".join(f"{law} {recovered[law]:.0f} of {starts[law]:.0f}" for law in starts)
     out = "gone out: " + ", ".join(f"{law} {v:.0f}" for law, v in left.items())
-    return Outcome(shown, all(recovered[law] >= RECOVERED * starts[law] for law in starts), out)
+    return CheckOutcome(shown, all(recovered[law] >= RECOVERED * starts[law] for law in starts), out)
 
 
-def _gone_out(evidence: Evidence) -> Outcome:
+def _gone_out(evidence: Evidence) -> CheckOutcome:
     """The state in which the reaction has gone out is shown: no law of this case ends it."""
     states = _analyses(evidence, "states_of_no_return", *BOTH)
     plant, mv = evidence.case.equations, evidence.case.plant_class.mv_signals[0]
@@ -192,10 +192,12 @@ def _gone_out(evidence: Evidence) -> Outcome:
         f"there the law asks for the least {mv.name}, {mv.low:g} {mv.unit}; to take fire again by itself the reactor "
         f"needs less than {rekindling_flow(plant):.1f} {mv.unit}"
     )
-    return Outcome(", ".join(f"{law} {v:.0f}" for law, v in states.items()), set(states.values()) == {1.0}, because)
+    return CheckOutcome(
+        ", ".join(f"{law} {v:.0f}" for law, v in states.items()), set(states.values()) == {1.0}, because
+    )
 
 
-def _in_order(evidence: Evidence) -> Outcome:
+def _in_order(evidence: Evidence) -> CheckOutcome:
     """One knob is ahead of PID 1, and none of PIDs 2 to 5 holds the whole range as PID 1 does."""
     knob, first, *others = (
         [evidence.measured(curve, test, "iae") for test in TESTS[:3]] for curve in (AUTO, PID_1, *ALONE)
@@ -204,7 +206,7 @@ def _in_order(evidence: Evidence) -> Outcome:
     rows = list(zip(knob, first, least, strict=True))
     shown = ", ".join(f"{number(a)} : {number(b)} : {number(c)}" for a, b, c in rows)
     each = "; ".join(f"PID {i}: {', '.join(number(v) for v in row)}" for i, row in enumerate(others, start=2))
-    return Outcome(shown, all(a < b < c for a, b, c in rows), each)
+    return CheckOutcome(shown, all(a < b < c for a, b, c in rows), each)
 
 
 CLAIMS = Claims(

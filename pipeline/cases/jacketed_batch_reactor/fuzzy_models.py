@@ -11,7 +11,7 @@ from matplotlib.figure import Figure as Canvas
 
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Array
-from loopwright.pipeline.evaluation.verdicts import Outcome
+from loopwright.pipeline.evaluation.verdicts import CheckOutcome
 from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, legend_below
 from loopwright.pipeline.pictures.numbers import number
 
@@ -137,22 +137,22 @@ def drift_when_shut(evidence: Evidence, how: str, at: float) -> tuple[float, flo
     return moved("hot"), moved("cold")
 
 
-def one_step_errors(evidence: Evidence) -> Outcome:
+def one_step_errors(evidence: Evidence) -> CheckOutcome:
     """Whether ties across the modes cost little accuracy, and less than parts that know nothing of each other."""
     found = _each(evidence, "rmse", "tied", "global", "local")
     shown = ", ".join(f"{how} {number(value)}" for how, value in found.items())
-    return Outcome(f"{shown} °C", found["tied"] <= LITTLE * found["global"] and found["tied"] < found["local"])
+    return CheckOutcome(f"{shown} °C", found["tied"] <= LITTLE * found["global"] and found["tied"] < found["local"])
 
 
-def gaps(evidence: Evidence) -> Outcome:
+def gaps(evidence: Evidence) -> CheckOutcome:
     """Whether no jacket temperature lies between the modes' ranges of the tied model, and some of the others'."""
     found = _each(evidence, "gap", *ORDER)
     shown = ", ".join(f"{how} {value:.2f}" for how, value in found.items())
     others = [value for how, value in found.items() if how != "tied"]
-    return Outcome(f"up to {shown} °C a period", found["tied"] <= NO_GAP < min(others))
+    return CheckOutcome(f"up to {shown} °C a period", found["tied"] <= NO_GAP < min(others))
 
 
-def weak_cold_valve(evidence: Evidence) -> Outcome:
+def weak_cold_valve(evidence: Evidence) -> CheckOutcome:
     """Whether the printed cold valve is much weaker than the reactor's at the jacket's lower limit."""
     printed, key = evidence.part(SET, "printed"), f"b_cold_{COLDEST:g}"
     sides = [printed.get(side, {}).get(key) for side in ("physics", "parameters")]
@@ -160,4 +160,4 @@ def weak_cold_valve(evidence: Evidence) -> Outcome:
         raise NotMeasuredError
     reactor, ours = map(float, sides)
     shown = f"{ours:.2f} printed, {reactor:.2f} °C in the reactor: {reactor / ours:.2f} times weaker"
-    return Outcome(shown, abs(ours) <= WEAK * abs(reactor))
+    return CheckOutcome(shown, abs(ours) <= WEAK * abs(reactor))

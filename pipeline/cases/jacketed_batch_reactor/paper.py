@@ -31,7 +31,7 @@ from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import MODES, 
 from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.words import law_name
 
@@ -41,7 +41,7 @@ MORE = 2  # switches: there and back
 ON_ITS_MODEL = Curve(FEEDFORWARD, PRINTED)
 
 
-def _ideal(evidence: Evidence) -> Outcome:
+def _ideal(evidence: Evidence) -> CheckOutcome:
     """The core against the reference that was adjusted for it two samples before."""
     names = ("adjusted_reference", "wanted_jacket", "reached_jacket")
     loop, info = evidence.info(ON_ITS_MODEL, "same_model", *names)
@@ -49,10 +49,10 @@ def _ideal(evidence: Evidence) -> Outcome:
     error = float(np.abs(adjusted[:-AHEAD] - loop["pv"][AHEAD:, 0]).max())
     moved = np.count_nonzero(np.abs(requested - reached) > ROUNDING)
     measured = f"largest distance {error:.1e} °C; {moved} of {len(requested)} jacket references were adjusted"
-    return Outcome(measured, error <= IDEAL, f"ideal is what rounding leaves, {IDEAL:g} °C")
+    return CheckOutcome(measured, error <= IDEAL, f"ideal is what rounding leaves, {IDEAL:g} °C")
 
 
-def _feedback(evidence: Evidence) -> Outcome:
+def _feedback(evidence: Evidence) -> CheckOutcome:
     offsets = {law: [evidence.measured(law, "theta_10_noise", m) for m in ("masse", "max_asse")] for law in LAWS}
     shown = ", ".join(
         f"{law_name(law)} {number(mean, 2)} ({number(worst, 2)})" for law, (mean, worst) in offsets.items()
@@ -61,10 +61,12 @@ def _feedback(evidence: Evidence) -> Outcome:
         "mean (largest) offset [°C] with the jacket's coefficients off by up to 10 % and noise, each law over the tied "
         f"model; enough is at most {OFFSET:g}"
     )
-    return Outcome(shown, all(worst <= OFFSET for law, (_, worst) in offsets.items() if law != FEEDFORWARD), because)
+    return CheckOutcome(
+        shown, all(worst <= OFFSET for law, (_, worst) in offsets.items() if law != FEEDFORWARD), because
+    )
 
 
-def _limits(evidence: Evidence) -> Outcome:
+def _limits(evidence: Evidence) -> CheckOutcome:
     (low, high), *others = (
         [evidence.measured(curve, test, metric) for metric in ("min_jacket", "max_jacket")]
         for curve, test in ((ON_ITS_MODEL, "same_model"), (ON_ITS_MODEL, "profile"), (Curve(OBSERVER), "profile"))
@@ -74,19 +76,19 @@ def _limits(evidence: Evidence) -> Outcome:
         f"{low:.2f} to {high:.2f} °C where the model is the plant; on the reactor {other}, with observers {learnt}"
     )
     holds = low >= 20.0 - ROUNDING and high <= 70.0 + ROUNDING
-    return Outcome(measured, holds, "the limits are those of the model's jacket, so they hold as it does")
+    return CheckOutcome(measured, holds, "the limits are those of the model's jacket, so they hold as it does")
 
 
-def _monotone(evidence: Evidence) -> Outcome:
+def _monotone(evidence: Evidence) -> CheckOutcome:
     """The gain of the throttle in each mode, at every rule; between two it lies between their values."""
     gains = {mode: theta[2] for mode, theta in zip(MODES, FuzzyBatchReactor().consequents(), strict=True)}
     shown = ", ".join(f"{mode} {min(b):g} to {max(b):g}" for mode, b in gains.items())
     holds = all(min(b) > 0 or max(b) < 0 for b in gains.values())
-    return Outcome(f"gain of the throttle [°C]: {shown}", holds, "no mode's gain changes its sign")
+    return CheckOutcome(f"gain of the throttle [°C]: {shown}", holds, "no mode's gain changes its sign")
 
 
 # ---------------------------------------------------------------- beyond the requirements
-def _followed(evidence: Evidence) -> Outcome:
+def _followed(evidence: Evidence) -> CheckOutcome:
     return replace(_ideal(evidence), because="")
 
 
@@ -95,13 +97,13 @@ def _on_reactor(evidence: Evidence, metric: str, *ways: str) -> dict[str, float]
     return {how: evidence.measured(Curve(FEEDFORWARD, {"part": how}), "profile", metric) for how in ways}
 
 
-def _identified(evidence: Evidence) -> Outcome:
+def _identified(evidence: Evidence) -> CheckOutcome:
     errors = _on_reactor(evidence, "tail_rms", "tied", "global", "local", "printed")
     shown = ", ".join(f"{how} {number(v)}" for how, v in errors.items())
-    return Outcome(f"{shown} °C", all(better < worse for better, worse in pairwise(errors.values())))
+    return CheckOutcome(f"{shown} °C", all(better < worse for better, worse in pairwise(errors.values())))
 
 
-def _quiet(evidence: Evidence) -> Outcome:
+def _quiet(evidence: Evidence) -> CheckOutcome:
     """Switches over each identification; where there are too many, the levels that a shut throttle cannot hold."""
     switches = _on_reactor(evidence, "switches", "tied", "global", "local")
     noisy = [how for how, v in switches.items() if v > min(switches.values()) + MORE]
@@ -112,14 +114,14 @@ def _quiet(evidence: Evidence) -> Outcome:
         for (how, level), (hot, cold) in drifts.items()
         if hot > ROUNDING and cold < -ROUNDING
     ]
-    return Outcome(", ".join(f"{how} {v:g}" for how, v in switches.items()), not noisy, "; ".join(reasons))
+    return CheckOutcome(", ".join(f"{how} {v:g}" for how, v in switches.items()), not noisy, "; ".join(reasons))
 
 
-def _dearer(evidence: Evidence) -> Outcome:
+def _dearer(evidence: Evidence) -> CheckOutcome:
     forms = [Curve(OBSERVER, {"switch_penalty": p}) for p in PENALTIES]
     counts = [evidence.measured(curve, "same_model_noise", "switches") for curve in forms]
     holds = all(a > b for a, b in pairwise(counts))
-    return Outcome(", ".join(f"{v:g}" for v in counts), holds, "on same_model with noise")
+    return CheckOutcome(", ".join(f"{v:g}" for v in counts), holds, "on same_model with noise")
 
 
 CLAIMS = Claims(

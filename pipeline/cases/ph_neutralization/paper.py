@@ -11,7 +11,7 @@ from loopwright.pipeline.cases.ph_neutralization.case import ADAPTIVE, FIXED, LI
 from loopwright.pipeline.evaluation.case import Curve, PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
 from loopwright.pipeline.pictures.loop_pictures import LONGEST
 from loopwright.pipeline.pictures.numbers import number, ratio
 from loopwright.pipeline.pictures.words import curve_label
@@ -68,20 +68,20 @@ def _compared(evidence: Evidence, scenario: str, *curves: Curve) -> tuple[list[f
     return values, f"SSE on {scenario}: {', '.join(shown)}"
 
 
-def _fixed(evidence: Evidence) -> Outcome:
+def _fixed(evidence: Evidence) -> CheckOutcome:
     overshoot = evidence.measured(FIXED, SET, "overshoot")
     (rule, tuned, adaptive), shown = _compared(evidence, SET, FIXED, Curve("pid"), ADAPTIVE)
     ahead = [words for words, sse in (("by the rule", rule), ("tuned in closed loop", tuned)) if sse < adaptive]
     because = f"the PID {' and '.join(ahead)} has a lower SSE than the adaptive form" if ahead else ""
-    return Outcome(f"overshoot {100 * overshoot:.0f} % of the step; {shown}", overshoot > OVERSHOOT, because)
+    return CheckOutcome(f"overshoot {100 * overshoot:.0f} % of the step; {shown}", overshoot > OVERSHOOT, because)
 
 
-def _slow(evidence: Evidence) -> Outcome:
+def _slow(evidence: Evidence) -> CheckOutcome:
     (slow, one), shown = _compared(evidence, SET, LINEARIZED, PENALTY_1)
-    return Outcome(shown, slow > SLOW * one, f"slow means an SSE above {SLOW:g} × that with a penalty of 1")
+    return CheckOutcome(shown, slow > SLOW * one, f"slow means an SSE above {SLOW:g} × that with a penalty of 1")
 
 
-def _adaptive(evidence: Evidence) -> Outcome:
+def _adaptive(evidence: Evidence) -> CheckOutcome:
     forms = (ADAPTIVE, PENALTY_1, PENALTY_LOW)
     measured = [c for c in forms if evidence.figure(c.law, SET, "sse", c.setting) is not None]
     if len(measured) < 2:
@@ -89,33 +89,35 @@ def _adaptive(evidence: Evidence) -> Outcome:
     (adaptive, *fixed), shown = _compared(evidence, SET, *measured)
     _, disturbed = _compared(evidence, DISTURBED, *measured)
     because = f"needed means an SSE below {NEEDED:g} × that of the best fixed penalty"
-    return Outcome(f"{shown}; {disturbed}", adaptive < NEEDED * min(fixed), because)
+    return CheckOutcome(f"{shown}; {disturbed}", adaptive < NEEDED * min(fixed), because)
 
 
-def _ahead_of_recursive(evidence: Evidence) -> Outcome:
+def _ahead_of_recursive(evidence: Evidence) -> CheckOutcome:
     pairs = ((PENALTY_1, RECURSIVE_1), (ADAPTIVE, RECURSIVE))
     compared = [_compared(evidence, SET, *pair) for pair in pairs]
     holds = all(ours < other for (ours, other), _ in compared)
-    return Outcome("; ".join(shown for _, shown in compared), holds, "first with equal penalties, then as in Table 3")
+    return CheckOutcome(
+        "; ".join(shown for _, shown in compared), holds, "first with equal penalties, then as in Table 3"
+    )
 
 
-def _ahead_of_self_tuning(evidence: Evidence) -> Outcome:
+def _ahead_of_self_tuning(evidence: Evidence) -> CheckOutcome:
     (other, adaptive, fixed), shown = _compared(evidence, SET, SELF_TUNING, ADAPTIVE, PENALTY_1)
     best = "; the self-tuning PID also beats the fixed penalty of 1" if other < fixed else ""
-    return Outcome(shown, adaptive < other, f"the paper's form has the adaptive penalty{best}")
+    return CheckOutcome(shown, adaptive < other, f"the paper's form has the adaptive penalty{best}")
 
 
-def _unstable(evidence: Evidence) -> Outcome:
+def _unstable(evidence: Evidence) -> CheckOutcome:
     shown, holds = [], False
     for curve in (RECURSIVE, RECURSIVE_1):
         sse, steady = (evidence.measured(curve, DISTURBED, metric) for metric in ("sse", "max_asse"))
         holds |= steady > REST
         penalty = f"penalty {curve.setting['penalty']:g}"
         shown.append(f"{penalty}: SSE {number(sse)}, steady error {number(steady, 2)}")
-    return Outcome("; ".join(shown), holds, f"a stable loop has a steady error below {REST:g} pH")
+    return CheckOutcome("; ".join(shown), holds, f"a stable loop has a steady error below {REST:g} pH")
 
 
-def _buffer_flow(evidence: Evidence) -> Outcome:
+def _buffer_flow(evidence: Evidence) -> CheckOutcome:
     """How far the printed disturbance would move pH, as one of the buffer's flow and as one of the acid's."""
     plant = evidence.case.equations
     _, mv = plant.steady_state_at(8.0)
@@ -135,33 +137,33 @@ def _buffer_flow(evidence: Evidence) -> Outcome:
     because = (
         f"the nominal acid flow is {nominal['q1']:g} ml/min, the buffer flow {nominal['q2']:g}; we test it as acid flow"
     )
-    return Outcome(measured, moved["q2"] > evidence.noise, because)
+    return CheckOutcome(measured, moved["q2"] > evidence.noise, because)
 
 
-def _at_bounds(evidence: Evidence) -> Outcome:
+def _at_bounds(evidence: Evidence) -> CheckOutcome:
     """The share of samples in which the best move needs a negative gain: a bound is active there."""
     _, info = evidence.info(ADAPTIVE, SET, "kc", "tau_i_s", "tau_d_s")
     too_long = info["tau_i_s"] > LONGEST * evidence.case.plant.period_s
     share = float(np.mean((info["kc"] <= 0) | too_long | (info["tau_d_s"] <= 0)))
     because = "without bounds, many settings give the same move; the law takes the one with the smallest change"
-    return Outcome(f"a bound is active in {100 * share:.0f} % of the samples on {SET}", share > 0, because)
+    return CheckOutcome(f"a bound is active in {100 * share:.0f} % of the samples on {SET}", share > 0, because)
 
 
 # ---------------------------------------------------------------- the plant itself
-def _flows(evidence: Evidence) -> Outcome:
+def _flows(evidence: Evidence) -> CheckOutcome:
     flows = {ph: float(evidence.case.equations.steady_state_at(ph)[1][0]) for ph in FLOWS}
     holds = all(abs(flows[ph] - flow) <= FLOW_ERROR for ph, flow in FLOWS.items())
-    return Outcome(", ".join(f"{flow:.1f}" for flow in flows.values()), holds)
+    return CheckOutcome(", ".join(f"{flow:.1f}" for flow in flows.values()), holds)
 
 
-def _one_step_order(evidence: Evidence) -> Outcome:
+def _one_step_order(evidence: Evidence) -> CheckOutcome:
     names = ("nnarx", "linearized", "recursive_0.8", "recursive_0.5")
     values = [evidence.measured("identification_example", "", f"one_step.{name}") for name in names]
     white = [evidence.figure("identification_example", "", f"one_step_white.{name}") for name in names]
     shown = (" < " if values == sorted(values) else ", ").join(map(number, values))
     whites = ", ".join(number(v) for v in white if v is not None)
     other = f"; with a white input, in the same order: {whites}" if None not in white else ""
-    return Outcome(f"SSE {shown}", values == sorted(values), f"with a smooth input{other}")
+    return CheckOutcome(f"SSE {shown}", values == sorted(values), f"with a smooth input{other}")
 
 
 CLAIMS = Claims(

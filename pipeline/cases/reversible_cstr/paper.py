@@ -16,7 +16,7 @@ from loopwright.pipeline.evaluation.closed_loop import overshoots
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Array
 from loopwright.pipeline.evaluation.timing import step_within
-from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
 from loopwright.pipeline.pictures.free_runs import free_run_fit_at_least, one_step_says_little
 from loopwright.pipeline.pictures.numbers import number
 
@@ -38,7 +38,7 @@ def _at_rest(evidence: Evidence) -> tuple[ReversibleCstr, Array, Array]:
     return plant, cvs[inside], xs[inside, 1]
 
 
-def _conversion(evidence: Evidence) -> Outcome:
+def _conversion(evidence: Evidence) -> CheckOutcome:
     plant, cvs, temperatures = _at_rest(evidence)
     mv, t = plant.mv_signals[0], np.array([temperatures.min(), temperatures.max()])
     forward, back = plant.k1 * np.exp(-plant.E1 / (R * t)), plant.k2 * np.exp(-plant.E2 / (R * t))
@@ -48,10 +48,10 @@ def _conversion(evidence: Evidence) -> Outcome:
         f"at most {most:.3f} mol/l of {plant.C_t:g} with {mv.name} from {mv.low:.3g} to {mv.high:g} {mv.unit}; the "
         f"reaction itself is in equilibrium at {there[0]:.2f} to {there[1]:.2f} mol/l"
     )
-    return Outcome(measured, most >= ALMOST * plant.C_t, f"almost complete is {100 * ALMOST:g} % and more")
+    return CheckOutcome(measured, most >= ALMOST * plant.C_t, f"almost complete is {100 * ALMOST:g} % and more")
 
 
-def _temperature(evidence: Evidence) -> Outcome:
+def _temperature(evidence: Evidence) -> CheckOutcome:
     plant, _, temperatures = _at_rest(evidence)
     low, high = float(temperatures.min()), float(temperatures.max())
     most = plant.beta * plant.C_t
@@ -59,7 +59,7 @@ def _temperature(evidence: Evidence) -> Outcome:
         f"full conversion warms the feed by {most:.1f} K; with the heat loss the reactor rests at {low:.0f} to "
         f"{high:.0f} K, the feed at {plant.T_in:g} K"
     )
-    return Outcome(measured, max(most, high - plant.T_in) > RISE)
+    return CheckOutcome(measured, max(most, high - plant.T_in) > RISE)
 
 
 # ---------------------------------------------------------------- the loops
@@ -67,7 +67,7 @@ def _figures(evidence: Evidence, scenario: str, metric: str, *curves: Curve) -> 
     return [evidence.measured(curve, scenario, metric) for curve in curves]
 
 
-def _sign(evidence: Evidence) -> Outcome:
+def _sign(evidence: Evidence) -> CheckOutcome:
     offset, settled = _figures(evidence, "levels", "max_asse", PRINTED_SIGN, PRINTED)
     loop = evidence.loop(PRINTED_SIGN, "levels")
     if loop is None:
@@ -83,10 +83,10 @@ def _sign(evidence: Evidence) -> Outcome:
     cvs, _, mvs = evidence.case.equations.steady_curve
     gains = np.gradient(cvs, mvs)[(mvs >= mv.low) & (mvs <= mv.high)]
     because = f"the plant's gain lies between {gains.min():.2f} and {gains.max():.2f} mol/l per {mv.unit}"
-    return Outcome(measured, share < SATURATED and offset <= settled, because)
+    return CheckOutcome(measured, share < SATURATED and offset <= settled, because)
 
 
-def _overshoot(evidence: Evidence) -> Outcome:
+def _overshoot(evidence: Evidence) -> CheckOutcome:
     network, pid = _figures(evidence, "levels", "overshoot", NETWORK, PRINTED)
     measured = f"mean overshoot on the levels: network {100 * network:.1f} % of the step, PID {100 * pid:.1f} %"
     (test,) = evidence.tests["levels"]
@@ -95,18 +95,18 @@ def _overshoot(evidence: Evidence) -> Outcome:
     sp = evidence.case.plant.sp_signals[0]
     reference = np.mean(overshoots(test.sp[:, 0], test.reference[:, 0], test.hold, sp.high - sp.low))
     because = f"the reference model's own is {100 * reference:.1f} %"
-    return Outcome(measured, network <= OVERSHOOT < pid, because)
+    return CheckOutcome(measured, network <= OVERSHOOT < pid, because)
 
 
-def _hotter(evidence: Evidence) -> Outcome:
+def _hotter(evidence: Evidence) -> CheckOutcome:
     errors = _figures(evidence, "tin", "iae", NETWORK, PRINTED, PI, TUNED)
     network, pid, pi, tuned = map(number, errors)
     because = f"PI control tuned for its loop is quicker still: {pi} on the reference model, {tuned} without one"
     holds = errors[0] < errors[1]
-    return Outcome(f"IAE {network} against {pid} mol/l s", holds, because if max(errors[2:]) < errors[0] else "")
+    return CheckOutcome(f"IAE {network} against {pid} mol/l s", holds, because if max(errors[2:]) < errors[0] else "")
 
 
-def _heat(evidence: Evidence) -> Outcome:
+def _heat(evidence: Evidence) -> CheckOutcome:
     network, pid = _figures(evidence, "dh", "iae", NETWORK, PRINTED)
     loop = evidence.loop(PRINTED, "dh")
     if loop is None:
@@ -114,22 +114,22 @@ def _heat(evidence: Evidence) -> Outcome:
     most = float(np.abs(loop["sp"][:, 0] - loop["pv"][:, 0]).max())
     measured = f"IAE {number(network)} against {number(pid)} mol/l s; C_B moves by {most:.1g} mol/l at most"
     because = "heat is a small matter here: slower reactions and a larger heat loss are tested beside it"
-    return Outcome(measured, network > pid, because)
+    return CheckOutcome(measured, network > pid, because)
 
 
-def _no_memory(evidence: Evidence) -> Outcome:
+def _no_memory(evidence: Evidence) -> CheckOutcome:
     plain, network = _figures(evidence, "levels", "max_asse", PLAIN, NETWORK)
     measured = f"end offset up to {number(plain, 2)} mol/l; of the incremental network {number(network, 2)}"
     because = "both errors are zero only where the one MV that it then gives is the steady one"
-    return Outcome(measured, plain <= OFFSET, because)
+    return CheckOutcome(measured, plain <= OFFSET, because)
 
 
-def _ahead(evidence: Evidence) -> Outcome:
+def _ahead(evidence: Evidence) -> CheckOutcome:
     tests = {"levels": "levels", "held_out": "random levels", "held_out_noise": "with noise"}
     errors = {words: _figures(evidence, test, "tracking", NETWORK, PI) for test, words in tests.items()}
     shown = ", ".join(f"{words} {number(ours, 2)} against {number(pi, 2)}" for words, (ours, pi) in errors.items())
     holds = all(ours < pi for ours, pi in errors.values())
-    return Outcome(f"RMS from the reference model [mol/l]: {shown}", holds, _other_side(evidence))
+    return CheckOutcome(f"RMS from the reference model [mol/l]: {shown}", holds, _other_side(evidence))
 
 
 def _other_side(evidence: Evidence) -> str:
@@ -152,18 +152,18 @@ def _other_side(evidence: Evidence) -> str:
     return "; ".join(rows)
 
 
-def _one_step(evidence: Evidence) -> Outcome:
+def _one_step(evidence: Evidence) -> CheckOutcome:
     outcome = one_step_says_little(SET, "nnarx", "C_B", "mol/l", evidence)
-    return Outcome(outcome.measured, not outcome.holds, outcome.because)
+    return CheckOutcome(outcome.measured, not outcome.holds, outcome.because)
 
 
 # ---------------------------------------------------------------- what is asked for
-def _no_other_root(evidence: Evidence) -> Outcome:
+def _no_other_root(evidence: Evidence) -> CheckOutcome:
     roots, least, largest = (
         evidence.measured(NETWORK, "", figure) for figure in ("other_roots", "least_gain", "largest_gain")
     )
     measured = f"{roots:.0f} over a grid; gain on a constant error {least:.3g} to {largest:.3g} l/s per mol/l"
-    return Outcome(measured, roots == 0, "its form leaves no room for one")
+    return CheckOutcome(measured, roots == 0, "its form leaves no room for one")
 
 
 CLAIMS = Claims(

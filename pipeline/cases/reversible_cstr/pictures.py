@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from loopwright.pipeline.cases.reversible_cstr.case import HOLD, NETWORK, PI, PLAIN, PRINTED
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Array, Loop
-from loopwright.pipeline.evaluation.verdicts import Outcome
+from loopwright.pipeline.evaluation.verdicts import CheckOutcome
 from loopwright.pipeline.pictures.drawing import (
     REFERENCE,
     SET_POINT,
@@ -77,11 +77,11 @@ def _words(model: ReferenceModel) -> str:
     return "   ".join(f"{c:.3f}" for c in model.coefficients) or "–"
 
 
-def beats_the_classic_tables(evidence: Evidence) -> Outcome:
+def beats_the_classic_tables(evidence: Evidence) -> CheckOutcome:
     """Whether the search's ITAE is below the classic table's for every order from 2."""
     pairs = {n: (ReferenceModel.optimal(n).itae(), ReferenceModel.classic(n).itae()) for n in CLASSIC if n > 1}
     shown = ", ".join(f"n = {n}: {ours:.3f} against {classic:.3f}" for n, (ours, classic) in pairs.items())
-    return Outcome(shown, all(ours < classic for ours, classic in pairs.values()))
+    return CheckOutcome(shown, all(ours < classic for ours, classic in pairs.values()))
 
 
 LAWS = {

@@ -14,7 +14,7 @@ from loopwright.pipeline.cases.thiosulfate_cstr.case import TJ
 from loopwright.pipeline.evaluation.case import PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, Claims, Outcome, plain_reason
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
 from loopwright.pipeline.plants.steady import Linearization
 
 # (C_A [mol/l], T [K]) at Tj = 250 K
@@ -109,7 +109,7 @@ def _inverse_parts(evidence: Evidence) -> list[Mapping[str, Any]]:
     return []
 
 
-def _of_inverse(evidence: Evidence, key: str, low: float, high: float, unit: str = "") -> Outcome:
+def _of_inverse(evidence: Evidence, key: str, low: float, high: float, unit: str = "") -> CheckOutcome:
     rows = _inverse_parts(evidence)
     values = [float(row[key]) for row in rows if row.get(key) is not None]
     if not values:
@@ -118,27 +118,27 @@ def _of_inverse(evidence: Evidence, key: str, low: float, high: float, unit: str
     measured = f"{median:.4g}{unit} ({min(values):.4g} to {max(values):.4g}, {len(values)} seeds)"
     used = {row.get("c") for row in rows} - {None}
     because = f"with {', '.join(f'{c:g}' for c in used)} fuzzy sets an input" if used else ""
-    return Outcome(measured, low <= median <= high, because)
+    return CheckOutcome(measured, low <= median <= high, because)
 
 
-def _centres(evidence: Evidence) -> Outcome:
+def _centres(evidence: Evidence) -> CheckOutcome:
     return _of_inverse(evidence, "centres", *CENTRES)
 
 
-def _rmse(evidence: Evidence) -> Outcome:
+def _rmse(evidence: Evidence) -> CheckOutcome:
     return _of_inverse(evidence, "rmse", 0.0, RMSE, " K")
 
 
-def _inc(evidence: Evidence) -> Outcome:
+def _inc(evidence: Evidence) -> CheckOutcome:
     because = f"an exact inverse cancels the zero of the sampled plant at this point, {_middle_zero(evidence):.3f}"
     error, bound = evidence.figure("inc", "sp_a", "mae"), evidence.bound("sp_a")
     if error is None or bound is None:
-        return Outcome("not measured", None, because)
+        return CheckOutcome("not measured", None, because)
     measured = f"INC's MAE on SP-A {error:.3g}, {error / bound:.2f} × NMPC"
-    return Outcome(measured, error > POOR * bound, f"above {POOR:g} × counts as not holding; {because}")
+    return CheckOutcome(measured, error > POOR * bound, f"above {POOR:g} × counts as not holding; {because}")
 
 
-def _minimum(evidence: Evidence) -> Outcome:
+def _minimum(evidence: Evidence) -> CheckOutcome:
     shown, reasons, holds = [], [], False
     for scenario, title in (("sp_a", "SP-A"), ("sp_b", "SP-B")):
         maes = _over_r(evidence, scenario)
@@ -150,54 +150,54 @@ def _minimum(evidence: Evidence) -> Outcome:
         shown.append(f"MAE on {title} " + ", ".join(f"r = {r:g}: {mae:.3g}" for r, mae in maes.items()))
         end = "" if inside else ", an end of the tried range"
         reasons.append(f"on {title} the minimum is at r = {best:g}{end}")
-    return Outcome("; ".join(shown), holds, "; ".join(reasons) + "; in the paper at 2.5")
+    return CheckOutcome("; ".join(shown), holds, "; ".join(reasons) + "; in the paper at 2.5")
 
 
-def _slow_pid(evidence: Evidence) -> Outcome:
+def _slow_pid(evidence: Evidence) -> CheckOutcome:
     mae, steady = (evidence.measured("pid", "sp_a", metric) for metric in ("mae", "max_asse"))
     bound = evidence.bound("sp_a")
     if bound is None:
         raise NotMeasuredError
     locked = evidence.laws["pid"].lock_ups
     measured = f"MAE on SP-A {mae:.3g}, {mae / bound:.2f} × NMPC, steady error up to {steady:.2g}, {locked} lock-ups"
-    return Outcome(measured, mae > POOR * bound or bool(locked), f"slow or unstable means above {POOR:g} ×")
+    return CheckOutcome(measured, mae > POOR * bound or bool(locked), f"slow or unstable means above {POOR:g} ×")
 
 
-def _no_offset(evidence: Evidence) -> Outcome:
+def _no_offset(evidence: Evidence) -> CheckOutcome:
     steady = evidence.measured("incadec", "sp_a", "max_asse")
     back = evidence.figure("incadec", "sp_a", "max_asse", BACK)
     because = "" if back is None else f"with back-calculation {back:.2g}"
-    return Outcome(f"steady error on SP-A up to {steady:.2g}", steady <= STEADY_ERROR, because)
+    return CheckOutcome(f"steady error on SP-A up to {steady:.2g}", steady <= STEADY_ERROR, because)
 
 
 # ---------------------------------------------------------------- the plant itself
-def _steady_states(evidence: Evidence) -> Outcome:
+def _steady_states(evidence: Evidence) -> CheckOutcome:
     states, expected = evidence.case.equations.steady_states(TJ), np.array(STEADY)
     if len(states) != len(expected):
-        return Outcome(f"{len(states)} steady states", False)
+        return CheckOutcome(f"{len(states)} steady states", False)
     error = float(np.max(np.abs(np.array(states) - expected) / [1.0, T_RANGE]))
-    return Outcome(f"largest difference {error:.1e}", error <= 1e-4)
+    return CheckOutcome(f"largest difference {error:.1e}", error <= 1e-4)
 
 
-def _turning_points(evidence: Evidence) -> Outcome:
+def _turning_points(evidence: Evidence) -> CheckOutcome:
     points = np.array([[*x, mv] for x, mv in evidence.case.equations.turning_points()])
     expected = np.array(TURNING)
     if points.shape != expected.shape:
-        return Outcome(f"{len(points)} found", False)
+        return CheckOutcome(f"{len(points)} found", False)
     error = np.max(np.abs(points - expected), axis=0)
     holds = bool(np.all(error <= [1e-4, 0.0501, 0.0501]))
-    return Outcome(f"largest differences {error[0]:.1e}, {error[1]:.2g} K, {error[2]:.2g} K", holds)
+    return CheckOutcome(f"largest differences {error[0]:.1e}, {error[1]:.2g} K, {error[2]:.2g} K", holds)
 
 
-def _eigenvalues(evidence: Evidence) -> Outcome:
+def _eigenvalues(evidence: Evidence) -> CheckOutcome:
     values = np.sort(_middle(evidence).eigenvalues.real)[::-1]
     error = float(np.max(np.abs(values - np.array(MIDDLE_EIGENVALUES))))
-    return Outcome(", ".join(f"{v:+.4f}" for v in values), error <= 1e-3)
+    return CheckOutcome(", ".join(f"{v:+.4f}" for v in values), error <= 1e-3)
 
 
-def _zero(evidence: Evidence) -> Outcome:
+def _zero(evidence: Evidence) -> CheckOutcome:
     zero = _middle_zero(evidence)
-    return Outcome(f"{zero:.4f}", abs(zero - MIDDLE_ZERO) <= 1e-3)
+    return CheckOutcome(f"{zero:.4f}", abs(zero - MIDDLE_ZERO) <= 1e-3)
 
 
 def _middle(evidence: Evidence) -> Linearization:

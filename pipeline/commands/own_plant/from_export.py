@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from loopwright.pipeline.commands.own_plant.knowledge import Widening
-from loopwright.pipeline.config.exports import ExportParams, Interval
+from loopwright.pipeline.config.exports import ExportParams, TimeSpan
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.cleaning.findings import counted
 from loopwright.pipeline.historian.cleaning.tags import (
@@ -50,7 +50,7 @@ def asked(options: argparse.Namespace, tags: Sequence[Tag]) -> ExportParams:
     """``exports.<name>``: all that was said of the files."""
     for text in options.leave_out:
         try:
-            Interval.of(text)
+            TimeSpan.of(text)
         except ValueError as error:
             raise RecordError(f"--leave-out {error}") from None
     return ExportParams(

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.excitation.planned import FirstTest, Plan, excited, first_test, planned
+from loopwright.pipeline.excitation.planned import ExperimentPlan, FirstTest, excited, first_test, planned
 from loopwright.pipeline.files import sha256, write_json
 from loopwright.pipeline.historian.cleaning.findings import Finding, Screening, TagReport
-from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.record_rows import evenly
-from loopwright.pipeline.historian.cleaning.sampling import Sampling
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
+from loopwright.pipeline.historian.cleaning.sampling import TagSampling
 from loopwright.pipeline.historian.cleaning.tags import SIGNAL_ROLES, Guess, Tag, named, write_tags
 from loopwright.pipeline.historian.excitation import judged
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.screening import Screened, models_of
-from loopwright.pipeline.plants.fmu.description import Description, FmuRow, FmuTable, Variable, described
+from loopwright.pipeline.plants.fmu.description import Description, FmuRow, FmuTable, FmuVariable, described
 from loopwright.pipeline.plants.fmu.program import variable_of
 from loopwright.pipeline.plants.simulator_file import FileSimulator
 from loopwright.pipeline.records.record import Record
@@ -41,7 +41,7 @@ def judged_record(
     tags = tuple(
         TagReport(
             s.name, s.name, role, s.unit, s.low, s.high, {"good": n}, {}, {}, 0, 0.0,
-            Sampling(s.name, h, irregular=False, dead_band=False, hold_s=h),
+            TagSampling(s.name, h, irregular=False, dead_band=False, hold_s=h),
         )
         for role, group in groups.items() for s in group
     )  # fmt: skip
@@ -83,7 +83,7 @@ class Simulated:
 
     plant: FileSimulator
     test: FirstTest
-    plan: Plan
+    plan: ExperimentPlan
     found: Screened
 
 
@@ -153,7 +153,7 @@ def _every(plant: FileSimulator, test: FirstTest, period_s: float | None) -> int
     return every
 
 
-def _findings(plant: FileSimulator, test: FirstTest, plan: Plan) -> list[Finding]:
+def _findings(plant: FileSimulator, test: FirstTest, plan: ExperimentPlan) -> list[Finding]:
     h, k = plant.period_s, test.settling_periods
     words = (
         f"settles within {k} periods of {h:g} s" if test.settles else f"does not settle; {k} periods to move a tenth"
@@ -224,18 +224,18 @@ def _clear(tags: Sequence[Tag]) -> bool:
     return [t.role for t in tags].count("mv") == 1 and all(t.low is not None and t.high is not None for t in tags)
 
 
-def _tag(v: Variable) -> Tag:
+def _tag(v: FmuVariable) -> Tag:
     return Tag(v.name, PROPOSED[v.causality], v.unit, v.low, v.high)
 
 
-def _remark(v: Variable) -> str:
+def _remark(v: FmuVariable) -> str:
     start = "" if v.start is None else f"starts at {v.start:g}"
     role = "an input: mv or dv" if v.causality == "input" else ""
     missing = MISSING if v.low is None or v.high is None else ""
     return "; ".join(filter(None, (role, start, missing, v.words)))
 
 
-def _with_range(tag: Tag, v: Variable) -> Tag:
+def _with_range(tag: Tag, v: FmuVariable) -> Tag:
     low, high = (v.low if tag.low is None else tag.low), (v.high if tag.high is None else tag.high)
     return replace(tag, unit=tag.unit or v.unit, low=low, high=high)
 

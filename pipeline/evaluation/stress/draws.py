@@ -27,7 +27,7 @@ STROKE = (5.0, 30.0)  # periods that a slow actuator takes over the MV's range
 
 
 @dataclass(frozen=True)
-class Fault:
+class ActuatorFault:
     """One fault of one actuator.
 
     ``size`` is the zero error as a share of the MV's range, the span error as a share of the travel, or the periods
@@ -50,18 +50,18 @@ class Fault:
         return f"{name} {self.kind} of {100 * self.size:+.2g} %"
 
 
-def draw_fault(rng: np.random.Generator, signals: Sequence[Signal], samples: int) -> Fault:
+def draw_fault(rng: np.random.Generator, signals: Sequence[Signal], samples: int) -> ActuatorFault:
     """A fault drawn at random over a test of ``samples``; a discrete MV can only stick."""
     mv, share = int(rng.integers(len(signals))), rng.uniform(size=3)
     kind = KINDS[min(int(share[0] * len(KINDS)), len(KINDS) - 1)] if signals[mv].values is None else STUCK
     if kind == STUCK:
         start = int(samples * (STUCK_FROM[0] + share[1] * (STUCK_FROM[1] - STUCK_FROM[0])))
         length = int(samples * (STUCK_FOR[0] + share[2] * (STUCK_FOR[1] - STUCK_FOR[0])))
-        return Fault(kind, mv, start=start, end=start + max(length, 1))
+        return ActuatorFault(kind, mv, start=start, end=start + max(length, 1))
     if kind == SLOW:
-        return Fault(kind, mv, size=float(STROKE[0] + share[1] * (STROKE[1] - STROKE[0])))
+        return ActuatorFault(kind, mv, size=float(STROKE[0] + share[1] * (STROKE[1] - STROKE[0])))
     most = MOST_ZERO if kind == ZERO else MOST_SPAN
-    return Fault(kind, mv, size=float(most * (2 * share[1] - 1)))
+    return ActuatorFault(kind, mv, size=float(most * (2 * share[1] - 1)))
 
 
 class Actuators:
@@ -74,7 +74,7 @@ class Actuators:
     """
 
     def __init__(
-        self, signals: Sequence[Signal], faults: Sequence[Fault | None], mv0: Array, late: Sequence[bool]
+        self, signals: Sequence[Signal], faults: Sequence[ActuatorFault | None], mv0: Array, late: Sequence[bool]
     ) -> None:
         n, m = mv0.shape
         self.low, self.high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
@@ -128,7 +128,7 @@ class Draw:
     load: float
     noise: float
     late: bool
-    fault: Fault | None
+    fault: ActuatorFault | None
     noise_seed: tuple[int, int, int]
 
     def deviation(self, plant: Simulator, std: Array) -> Array:

@@ -87,7 +87,7 @@ def _product(x: Array, weights: Array) -> Array:
 
 # ----------------------------------------------------------------------------------------------------------- the loops
 @dataclass(frozen=True)
-class Outcome:
+class StressOutcome:
     """Figures of one loop. One that left what the plant can compute has infinite figures.
 
     ``swings`` says whether a controlled variable still swings about its set point as the test ends: no failure by
@@ -126,11 +126,11 @@ class Stress:
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}  # a session stays where it was made
 
-    def outcomes(self, indices: Sequence[int]) -> list[Outcome]:
+    def outcomes(self, indices: Sequence[int]) -> list[StressOutcome]:
         """Figures of the loops with these numbers, in order."""
         return [self._outcome(draw, *loop) for draw, loop in self.loops(self.drawing.draws(indices))]
 
-    def loop(self, index: int) -> tuple[Draw, Trajectory, Outcome]:
+    def loop(self, index: int) -> tuple[Draw, Trajectory, StressOutcome]:
         """One loop with its course."""
         ((draw, loop),) = self.loops([self.drawing.draw(index)])
         return draw, loop[0], self._outcome(draw, *loop)
@@ -186,7 +186,7 @@ class Stress:
             for i in range(n)
         ]  # fmt: skip
 
-    def _outcome(self, draw: Draw, loop: Trajectory, broke: bool) -> Outcome:
+    def _outcome(self, draw: Draw, loop: Trajectory, broke: bool) -> StressOutcome:
         case, plant, test = self.drawing.case, self.drawing.plant_of(draw.scenario), draw.scenario
         n_cv = test.sp.shape[1]
         mvs, cvs = plant.mv_signals[:n_cv], plant.sp_signals
@@ -195,7 +195,7 @@ class Stress:
         ends: dict[str, list[float]] = {end: [getattr(s, end) for s in cvs] for end in ("low", "high")}
         # A loop that is broken has no figures of worth; as infinite ones they count as worst.
         figures = case.score(test, loop.pv, loop.mv)
-        return Outcome(
+        return StressOutcome(
             draw.index,
             dict.fromkeys(figures, float("inf")) if broke else figures,
             locked_up(loop.sp, loop.pv[:, :n_cv], loop.mv[:, :n_cv], test.hold, **limits, span=spans),
@@ -206,7 +206,7 @@ class Stress:
         )
 
 
-def figures_of(outcomes: Sequence[Outcome], name: str) -> Array:
+def figures_of(outcomes: Sequence[StressOutcome], name: str) -> Array:
     """One figure of all loops, (n,); NaN of a loop whose test has no such figure."""
     return np.array([one.figures.get(name, np.nan) for one in outcomes])
 

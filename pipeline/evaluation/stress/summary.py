@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.evaluation.case import Case, Requirement
 from loopwright.pipeline.evaluation.stress.draws import Draw
-from loopwright.pipeline.evaluation.stress.loops import Outcome, figures_of
+from loopwright.pipeline.evaluation.stress.loops import StressOutcome, figures_of
 from loopwright.pipeline.plants.simulator import Array
 
 QUANTILES = (0.05, 0.5, 0.9, 0.99, 1.0)  # of a figure over the loops of one test or of all, the largest value last
@@ -63,7 +63,7 @@ class Summary:
     case: Case
     name: str  # of the controller
     draws: Sequence[Draw]
-    outcomes: Sequence[Outcome]
+    outcomes: Sequence[StressOutcome]
 
     @property
     def counts(self) -> dict[str, int]:
@@ -168,7 +168,7 @@ def _grown(name: str, at: tuple[float, ...] | tuple[str, ...], groups: Sequence[
     return Growth(name, at, median, high)
 
 
-def table(draws: Sequence[Draw], outcomes: Sequence[Outcome]) -> Mapping[str, list[object]]:
+def table(draws: Sequence[Draw], outcomes: Sequence[StressOutcome]) -> Mapping[str, list[object]]:
     """One row a loop for programs: what was drawn, its figures, and how it failed. None where a test has none."""
     rows: list[dict[str, object]] = []
     for draw, one in zip(draws, outcomes, strict=True):

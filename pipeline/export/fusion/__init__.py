@@ -10,7 +10,7 @@ from loopwright.pipeline.export.fusion.forms import forms_of
 from loopwright.pipeline.export.fusion.items import Items
 from loopwright.pipeline.export.fusion.joining import joined
 from loopwright.pipeline.export.fusion.plan import Item
-from loopwright.pipeline.export.fusion.reading import Reading
+from loopwright.pipeline.export.fusion.reading import GraphReading
 
 LEAST_SHARE = 0.002
 """A graph must save this share of its price; else it stays as it is."""
@@ -27,7 +27,7 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
     together = joined(model)
     for given in (model,) if together is None else (model, together):
         for factors in (True, False):
-            reading = Reading(given, factors=factors)
+            reading = GraphReading(given, factors=factors)
             items, outputs = listed(reading)
             after = choose(items.choices, [item for _, item in outputs if isinstance(item, Item)])
             candidates.append((after, items, outputs, reading))
@@ -39,7 +39,7 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
     return emitted(items, outputs, model)
 
 
-def listed(reading: Reading) -> tuple[Items, Outputs]:
+def listed(reading: GraphReading) -> tuple[Items, Outputs]:
     """All that the graph may be made of, and its outputs."""
     items = Items(reading)
     # Each behind its operands: asked for from the end, a long chain of them would be a deep recursion.

@@ -220,11 +220,11 @@ class Block:
     low: float = -inf
     high: float = inf
     siblings: list[Block] = field(default_factory=list)
-    wide: Value | None = None
+    wide: AffineValue | None = None
 
 
 @dataclass(eq=False)
-class Value:
+class AffineValue:
     """An affine function of blocks, at the level of the latest.
 
     ``affine`` is None where the value is one block that is too large for a matrix, or holds no
@@ -250,11 +250,11 @@ class Origin:
     place: int = 0
 
 
-Operand: TypeAlias = Value | Array | None
+Operand: TypeAlias = AffineValue | Array | None
 """Input of an operator: a value, a constant, or left out."""
 
 
-def picked(value: Value) -> tuple[int, Array] | None:
+def picked(value: AffineValue) -> tuple[int, Array] | None:
     """The one block of which a value is a selection, and the elements' places in it, of the value's shape."""
     affine = value.affine
     if affine is None or len(affine.parts) != 1 or affine.constant.any():
@@ -265,7 +265,7 @@ def picked(value: Value) -> tuple[int, Array] | None:
     return number, np.asarray(matrix.argmax(axis=0))
 
 
-def whole(value: Value, block: Block) -> bool:
+def whole(value: AffineValue, block: Block) -> bool:
     """Whether a value is all of a block, perhaps in another shape."""
     found = picked(value)
     return (

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from loopwright.pipeline.export.fusion.affine import Value
+from loopwright.pipeline.export.fusion.affine import AffineValue
 from loopwright.pipeline.export.fusion.items import Items
-from loopwright.pipeline.export.fusion.plan import Account, Choice, Item, Member
-from loopwright.pipeline.export.fusion.pools import Selection
+from loopwright.pipeline.export.fusion.plan import Account, FormChoice, Item, Member
+from loopwright.pipeline.export.fusion.pools import SelectionPool
 
 PREFERENCES = (
     ("recipe", "selection", "elementwise", "segments", "increment", "row", "group"),
@@ -20,7 +20,7 @@ SWEEPS = 4  # over all choices, each with the others as they are
 LEAST_GAIN = 0.01  # ns
 
 
-def choose(choices: list[Choice], roots: list[Item]) -> float:
+def choose(choices: list[FormChoice], roots: list[Item]) -> float:
     """Choose a form for each value; the price of all [ns]."""
     found = []
     for kinds in dict.fromkeys(_preferred(preference, choices) for preference in PREFERENCES):
@@ -36,7 +36,7 @@ def choose(choices: list[Choice], roots: list[Item]) -> float:
     return account.total
 
 
-def _sweep(account: Account, choices: list[Choice]) -> None:
+def _sweep(account: Account, choices: list[FormChoice]) -> None:
     """One value after the other, latest first, again while that pays."""
     latest_first = sorted((c for c in choices if len(c.forms) > 1), key=lambda c: c.order, reverse=True)
     for _ in range(SWEEPS):
@@ -48,7 +48,7 @@ def _sweep(account: Account, choices: list[Choice]) -> None:
             break
 
 
-def _improve(account: Account, choice: Choice) -> None:
+def _improve(account: Account, choice: FormChoice) -> None:
     """The cheapest form of one choice, the others as they are."""
     best, least = choice.kind, account.total
     for kind in choice.forms:
@@ -60,12 +60,12 @@ def _improve(account: Account, choice: Choice) -> None:
         account.choose(choice, best)
 
 
-def _preferred(preference: tuple[str, ...], choices: list[Choice]) -> tuple[str, ...]:
+def _preferred(preference: tuple[str, ...], choices: list[FormChoice]) -> tuple[str, ...]:
     """The kind of form of each choice that comes first."""
     return tuple(next((k for k in preference if k in c.forms), next(iter(c.forms))) for c in choices)
 
 
-def _with(kinds: tuple[str, ...], choices: list[Choice], roots: list[Item]) -> Account:
+def _with(kinds: tuple[str, ...], choices: list[FormChoice], roots: list[Item]) -> Account:
     account = Account()
     for choice, kind in zip(choices, kinds, strict=True):
         account.choose(choice, kind)
@@ -82,7 +82,7 @@ def _without(account: Account, roots: list[Item]) -> None:
 LEVELS = 3  # so much later at most
 
 
-def postpone(items: Items, decided: Sequence[tuple[Choice, Value]]) -> None:
+def postpone(items: Items, decided: Sequence[tuple[FormChoice, AffineValue]]) -> None:
     """Offer each value that can be a piece of its level's product the products of later levels too.
 
     A value may wait until the level below the lowest block that can depend on it in any form. So no choice makes a
@@ -109,7 +109,7 @@ def _first_users(items: Items) -> dict[int, int]:
             if id(item) in seen:
                 continue
             seen.add(id(item))
-            if isinstance(item, Choice):
+            if isinstance(item, FormChoice):
                 found[id(item)] = block.level
             stack.extend(_possible(item))
     return found
@@ -117,8 +117,8 @@ def _first_users(items: Items) -> dict[int, int]:
 
 def _possible(item: Item) -> Iterable[Item]:
     """The inputs of an item, whatever is chosen; of a product only its pieces, whose blocks are known."""
-    if isinstance(item, Choice):
+    if isinstance(item, FormChoice):
         return item.forms.values()
-    if isinstance(item, Member) and isinstance(item.pool, Selection):
+    if isinstance(item, Member) and isinstance(item.pool, SelectionPool):
         return [item.pool.source]
     return item.uses

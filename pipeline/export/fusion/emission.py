@@ -12,8 +12,17 @@ from onnx import helper, numpy_helper
 
 from loopwright.pipeline.export.fusion.affine import Array, Attributes, Shape, numbers
 from loopwright.pipeline.export.fusion.items import Items
-from loopwright.pipeline.export.fusion.plan import Choice, Given, Input, Item, Member, Output, Several, Step
-from loopwright.pipeline.export.fusion.pools import Group, Selection
+from loopwright.pipeline.export.fusion.plan import (
+    FormChoice,
+    GraphInput,
+    Input,
+    Item,
+    Member,
+    OperatorStep,
+    Output,
+    Several,
+)
+from loopwright.pipeline.export.fusion.pools import Group, SelectionPool
 
 Outputs: TypeAlias = Sequence[tuple[str, Input]]
 """The graph's outputs by their names."""
@@ -78,11 +87,11 @@ class _Writer:
 
     # ------------------------------------------------------------------ items
     def _write(self, item: Item) -> None:
-        if isinstance(item, Given):
+        if isinstance(item, GraphInput):
             self.names[id(item)] = item.name
-        elif isinstance(item, Choice):
+        elif isinstance(item, FormChoice):
             self.names[id(item)] = self.names[id(item.uses[0])]
-        elif isinstance(item, Step):
+        elif isinstance(item, OperatorStep):
             self._node(item.op, item.inputs, item.attributes, [self._new(item)])
         elif isinstance(item, Several):
             names = [self._fresh() for _ in item.shapes]
@@ -90,14 +99,14 @@ class _Writer:
             self.names[id(item)] = " ".join(names)
         elif isinstance(item, Output):
             self.names[id(item)] = self.names[id(item.uses[0])].split(" ")[item.place]
-        elif isinstance(item, Selection):
+        elif isinstance(item, SelectionPool):
             self._select(item)
         elif isinstance(item, Group):
             self._product(item)
         else:
             assert isinstance(item, Member)  # written with its pool
 
-    def _select(self, pool: Selection) -> None:
+    def _select(self, pool: SelectionPool) -> None:
         pieces = pool.lengths()
         if pieces is not None:
             names = [self._fresh() if member is None else self._new(member) for member, _ in pieces]
@@ -239,6 +248,6 @@ class _Writer:
 
 
 def _chosen(item: Item) -> Item:
-    while isinstance(item, Choice):
+    while isinstance(item, FormChoice):
         item = item.uses[0]
     return item

@@ -14,11 +14,11 @@ import numpy as np
 from loopwright.pipeline.export.fusion.affine import (
     DENSE,
     Affine,
+    AffineValue,
     Array,
     Operand,
     Origin,
     Shape,
-    Value,
     numbers,
     picked,
     places_of,
@@ -31,7 +31,7 @@ RUNS = 8  # pieces of a value put together from runs at most
 MOVING = frozenset({"Slice", "Split", "Gather"})
 
 
-def forms_of(items: Items, value: Value) -> dict[str, Item]:
+def forms_of(items: Items, value: AffineValue) -> dict[str, Item]:
     """The items that give a value, by the kind of form; at least one."""
     affine = value.affine
     assert affine is not None
@@ -49,7 +49,7 @@ def forms_of(items: Items, value: Value) -> dict[str, Item]:
     return kept or {"product": items.member(value, alone=True)}
 
 
-def _selection(items: Items, value: Value) -> Item | None:
+def _selection(items: Items, value: AffineValue) -> Item | None:
     """Elements of one block."""
     found = picked(value)
     if found is None:
@@ -93,7 +93,7 @@ def _sum(items: Items, affine: Affine, start: Item | None) -> Item | None:
     return total if isinstance(total, Item) else None
 
 
-def _increment(items: Items, value: Value, affine: Affine) -> Item | None:
+def _increment(items: Items, value: AffineValue, affine: Affine) -> Item | None:
     """An older value and what the newest blocks add to it."""
     newest = [b for b in affine.parts if items.reading.blocks[b].level == value.level]
     older = [b for b in affine.parts if b not in newest]
@@ -111,7 +111,7 @@ def _increment(items: Items, value: Value, affine: Affine) -> Item | None:
     return items.step("Add", [start, items.of(added)], value.shape)
 
 
-def _segments(items: Items, value: Value, affine: Affine) -> Item | None:
+def _segments(items: Items, value: AffineValue, affine: Affine) -> Item | None:
     """Runs of elements of one level or one block, put together."""
     if len(value.shape) != 1:
         return None
@@ -134,13 +134,13 @@ def _segments(items: Items, value: Value, affine: Affine) -> Item | None:
     return items.step("Concat", pieces, value.shape, {"axis": 0})
 
 
-def _squares(items: Items, value: Value) -> Item | None:
+def _squares(items: Items, value: AffineValue) -> Item | None:
     """The sum of the squares of a value."""
     if value.origin is None or value.origin.op != "ReduceSum":
         return None
     squared, *axes = value.origin.operands
-    found = picked(squared) if isinstance(squared, Value) else None
-    if found is None or not isinstance(squared, Value):
+    found = picked(squared) if isinstance(squared, AffineValue) else None
+    if found is None or not isinstance(squared, AffineValue):
         return None
     block = items.reading.blocks[found[0]]
     if block.op != "Mul" or block.operands[0] is not block.operands[1] or block.shape != squared.shape:
@@ -151,7 +151,7 @@ def _squares(items: Items, value: Value) -> Item | None:
     return items.step("ReduceSumSquare", inputs, value.shape, value.origin.attributes)
 
 
-def _recipe(items: Items, value: Value) -> Item | None:
+def _recipe(items: Items, value: AffineValue) -> Item | None:
     """The operator that stands in the graph."""
     origin = value.origin
     if origin is None:
@@ -168,12 +168,12 @@ def _recipe(items: Items, value: Value) -> Item | None:
     return items.step(origin.op, inputs, value.shape, origin.attributes)
 
 
-def _before(operand: Operand, value: Value) -> bool:
+def _before(operand: Operand, value: AffineValue) -> bool:
     """Whether a value may be computed from an operand: by cancellation it may be part of what it is made of."""
-    return not isinstance(operand, Value) or (operand.level <= value.level and operand.number < value.number)
+    return not isinstance(operand, AffineValue) or (operand.level <= value.level and operand.number < value.number)
 
 
-def _group(items: Items, value: Value, affine: Affine, lead: Shape = ()) -> Item | None:
+def _group(items: Items, value: AffineValue, affine: Affine, lead: Shape = ()) -> Item | None:
     """A piece of the product of its level. Not where a block may be no number, which would spread to all pieces."""
     if sum(map(len, affine.parts.values())) * prod(value.shape) > DENSE or items.reading.risky(value):
         return None

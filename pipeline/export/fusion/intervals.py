@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from loopwright.pipeline.export.fusion.affine import Array, Block, Operand, Value
+from loopwright.pipeline.export.fusion.affine import AffineValue, Array, Block, Operand
 
 Interval: TypeAlias = tuple[float, float]
 ALL: Interval = (-inf, inf)
@@ -28,7 +28,7 @@ def interval(operand: Operand, blocks: Sequence[Block]) -> Interval:
     """Bounds of all elements of an operand."""
     if operand is None:
         return ALL
-    if not isinstance(operand, Value):
+    if not isinstance(operand, AffineValue):
         return (float(np.min(operand)), float(np.max(operand))) if operand.size else ALL
     if operand.affine is None:
         return ALL if operand.block is None else (operand.block.low, operand.block.high)

@@ -9,10 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.pipeline.export.fusion.affine import Attributes, Block, Operand, Shape, Value, picked, whole
-from loopwright.pipeline.export.fusion.plan import Choice, Given, Input, Item, Member, Output, Several, Step
-from loopwright.pipeline.export.fusion.pools import Group, Selection  # fmt: skip
-from loopwright.pipeline.export.fusion.reading import Reading
+from loopwright.pipeline.export.fusion.affine import AffineValue, Attributes, Block, Operand, Shape, picked, whole
+from loopwright.pipeline.export.fusion.plan import (
+    FormChoice,
+    GraphInput,
+    Input,
+    Item,
+    Member,
+    OperatorStep,
+    Output,
+    Several,
+)
+from loopwright.pipeline.export.fusion.pools import Group, SelectionPool  # fmt: skip
+from loopwright.pipeline.export.fusion.reading import GraphReading
 
 INT64 = 7  # ONNX's number of the type
 
@@ -20,20 +29,20 @@ INT64 = 7  # ONNX's number of the type
 class Items:
     """Makes items. ``choices`` can be computed in several ways; ``undecided`` are those that have no forms yet."""
 
-    def __init__(self, reading: Reading) -> None:
+    def __init__(self, reading: GraphReading) -> None:
         self.reading = reading
-        self.choices: list[Choice] = []
-        self.undecided: list[tuple[Choice, Value]] = []
+        self.choices: list[FormChoice] = []
+        self.undecided: list[tuple[FormChoice, AffineValue]] = []
         self._values: dict[int, Item] = {}
         self._blocks: dict[int, Item] = {}
-        self._steps: dict[Any, Step] = {}
+        self._steps: dict[Any, OperatorStep] = {}
         self._splits: dict[Any, Several] = {}
-        self._selections: dict[int, Selection] = {}
+        self._selections: dict[int, SelectionPool] = {}
         self._groups: dict[tuple[int, Shape], Group] = {}
 
     def of(self, operand: Operand) -> Input:
         """An operator's operand: an item, or a constant."""
-        if not isinstance(operand, Value):
+        if not isinstance(operand, AffineValue):
             return operand
         if operand.affine is None:
             assert operand.block is not None
@@ -44,11 +53,11 @@ class Items:
             self._values[operand.number] = self._of_value(operand)
         return self._values[operand.number]
 
-    def _of_value(self, value: Value) -> Item:
+    def _of_value(self, value: AffineValue) -> Item:
         found = picked(value)
         if found is not None and whole(value, self.reading.blocks[found[0]]):
             return self.reshaped(self.block(self.reading.blocks[found[0]]), value.shape)
-        choice = Choice(value.shape, (value.level, value.number))
+        choice = FormChoice(value.shape, (value.level, value.number))
         self.choices.append(choice)
         self.undecided.append((choice, value))
         return choice
@@ -67,7 +76,7 @@ class Items:
 
     def _of_block(self, block: Block) -> Item:
         if not block.op:
-            return Given(block.name, block.shape)
+            return GraphInput(block.name, block.shape)
         inputs = [self.of(o) for o in block.operands]
         if len(block.siblings) > 1:
             several = Several(block.op, inputs, [b.shape for b in block.siblings], block.attributes)
@@ -77,12 +86,12 @@ class Items:
         step = self.step(block.op, inputs, block.shape, block.attributes)
         if block.wide is None:
             return step
-        choice = Choice(block.shape, (block.level, -1))
+        choice = FormChoice(block.shape, (block.level, -1))
         choice.forms = {"recipe": step, "gather": self._switch(block, block.wide, inputs[0])}
         self.choices.append(choice)
         return choice
 
-    def _switch(self, block: Block, wide: Value, condition: Input) -> Item:
+    def _switch(self, block: Block, wide: AffineValue, condition: Input) -> Item:
         """A Where on a single condition as a Gather from its two branches."""
         assert isinstance(condition, Item)
         index: Item = self.step("Cast", [condition], condition.shape, {"to": INT64})
@@ -92,11 +101,13 @@ class Items:
         return self.step("Gather", [pair, self.reshaped(index, ())], block.shape, {"axis": 0})
 
     # ------------------------------------------------------------------ operators
-    def step(self, op: str, inputs: Sequence[Input], shape: Shape, attributes: Attributes | None = None) -> Step:
+    def step(
+        self, op: str, inputs: Sequence[Input], shape: Shape, attributes: Attributes | None = None
+    ) -> OperatorStep:
         """An operator with one output."""
         key = (op, tuple(map(_key, inputs)), shape, tuple(sorted((k, str(v)) for k, v in (attributes or {}).items())))
         if key not in self._steps:
-            self._steps[key] = Step(op, inputs, shape, attributes or {})
+            self._steps[key] = OperatorStep(op, inputs, shape, attributes or {})
         return self._steps[key]
 
     def reshaped(self, item: Item, shape: Shape) -> Item:
@@ -113,10 +124,10 @@ class Items:
     def piece(self, source: Item, start: int, stop: int) -> Member:
         """Elements start .. stop - 1 of a vector."""
         if id(source) not in self._selections:
-            self._selections[id(source)] = Selection(source)
+            self._selections[id(source)] = SelectionPool(source)
         return self._selections[id(source)].piece(start, stop)
 
-    def member(self, value: Value, *, lead: Shape = (), alone: bool = False, level: int | None = None) -> Item:
+    def member(self, value: AffineValue, *, lead: Shape = (), alone: bool = False, level: int | None = None) -> Item:
         """A value as a piece of the product of a level, its own if not given, or of one for itself alone.
 
         ``lead``: (1,) of rows.

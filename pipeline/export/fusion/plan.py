@@ -23,7 +23,7 @@ class Item:
 Input: TypeAlias = "Item | Array | None"
 
 
-class Step(Item):
+class OperatorStep(Item):
     """One operator with one output."""
 
     __slots__ = ("attributes", "inputs", "op")
@@ -34,7 +34,7 @@ class Step(Item):
         self.op, self.inputs, self.attributes = op, list(inputs), attributes
 
 
-class Given(Item):
+class GraphInput(Item):
     """An input of the graph."""
 
     __slots__ = ("name",)
@@ -65,7 +65,7 @@ class Output(Item):
         self.place = place
 
 
-class Choice(Item):
+class FormChoice(Item):
     """A value or a block that can be computed in several ways, ``forms`` by their kind; one is chosen."""
 
     __slots__ = ("forms", "kind", "order")
@@ -143,7 +143,7 @@ class Account:
                 now.pool.members.remove(now)
                 stack.extend(self._settled(now.pool)[1])
 
-    def choose(self, choice: Choice, kind: str) -> None:
+    def choose(self, choice: FormChoice, kind: str) -> None:
         """Another form of a value or a block."""
         old, choice.kind = list(choice.uses), kind
         choice.uses = [choice.forms[kind]]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import prod
 
-from loopwright.pipeline.export.fusion.affine import Block, Shape, Value
+from loopwright.pipeline.export.fusion.affine import AffineValue, Block, Shape
 from loopwright.pipeline.export.fusion.plan import FIXED, INPUT, OUTPUT, Item, Member, Pool, product
 
 
-class Selection(Pool):
+class SelectionPool(Pool):
     """Runs of elements (start, stop) of one flat block: by a Split where they are many, else by a Gather each."""
 
     __slots__ = ("_pieces", "runs", "source")
@@ -66,9 +66,9 @@ class Group(Pool):
     def __init__(self, level: int, lead: Shape, blocks: Sequence[Block], flat: Callable[[int], Item]) -> None:
         super().__init__()
         self.level, self.lead, self.blocks, self.flat = level, lead, blocks, flat
-        self.values: dict[int, Value] = {}  # by the member's id
+        self.values: dict[int, AffineValue] = {}  # by the member's id
 
-    def piece(self, value: Value) -> Member:
+    def piece(self, value: AffineValue) -> Member:
         """A value as a vector or a row."""
         member = Member((*self.lead, prod(value.shape)), self)
         self.values[id(member)] = value
@@ -87,7 +87,7 @@ class Group(Pool):
         """Whether any member has a constant."""
         return any(v.affine is not None and v.affine.constant.any() for v in map(self._value, self.members))
 
-    def _value(self, member: Member) -> Value:
+    def _value(self, member: Member) -> AffineValue:
         return self.values[id(member)]
 
     def settle(self) -> tuple[float, list[Item]]:

@@ -13,13 +13,13 @@ from loopwright.pipeline.export.fusion import intervals, reading
 from loopwright.pipeline.export.fusion.affine import (
     DENSE,
     Affine,
+    AffineValue,
     Array,
     Attributes,
     Block,
     Operand,
     Origin,
     Shape,
-    Value,
     applied,
     numbers,
     whole,
@@ -34,14 +34,14 @@ GATHERED = 200  # elements of a Where that may be chosen by a Gather, at most
 
 
 # ---------------------------------------------------------------------- Where
-def switched(reading: Reading, operands: list[Operand], shape: Shape) -> Value | None:
+def switched(reading: GraphReading, operands: list[Operand], shape: Shape) -> AffineValue | None:
     """Where between constants, or a value and zero, by the condition as 0 or 1, if that gives the same numbers."""
     condition, one, other = operands
-    if not isinstance(condition, Value) or prod(shape) ** 2 > DENSE:
+    if not isinstance(condition, AffineValue) or prod(shape) ** 2 > DENSE:
         return None
-    if isinstance(one, Value) and isinstance(other, np.ndarray) and not other.any():
+    if isinstance(one, AffineValue) and isinstance(other, np.ndarray) and not other.any():
         return _kept(reading, condition, one, shape)
-    if isinstance(other, Value) and isinstance(one, np.ndarray) and not one.any():
+    if isinstance(other, AffineValue) and isinstance(one, np.ndarray) and not one.any():
         kept = _kept(reading, condition, other, shape)
         if kept is None or kept.affine is None or other.affine is None:
             return None
@@ -57,27 +57,27 @@ def switched(reading: Reading, operands: list[Operand], shape: Shape) -> Value |
     return reading.value(number.spread(shape).times(change).plus(Affine(np.asarray(other), {})))
 
 
-def _kept(reading: Reading, condition: Value, value: Value, shape: Shape) -> Value | None:
+def _kept(reading: GraphReading, condition: AffineValue, value: AffineValue, shape: Shape) -> AffineValue | None:
     """A value where the condition holds, else zero: their product, if the value is surely finite."""
     if value.affine is None or reading.risky(value):
         return None
     return reading.computed("Mul", {}, [value, _number(reading, condition)], [""], [shape])[0]
 
 
-def _number(reading: Reading, condition: Value) -> Value:
+def _number(reading: GraphReading, condition: AffineValue) -> AffineValue:
     """A condition as 0 or 1."""
     return reading.computed("Cast", {"to": DOUBLE}, [condition], [""], [condition.shape])[0]
 
 
-def wide(reading: Reading, operands: list[Operand], shape: Shape) -> Value | None:
+def wide(reading: GraphReading, operands: list[Operand], shape: Shape) -> AffineValue | None:
     """The branches of a Where on a single condition as one vector, the second first; None where it may not be one."""
     condition, *branches = operands
     n = prod(shape)
-    if not isinstance(condition, Value) or prod(condition.shape) != 1 or n > GATHERED:
+    if not isinstance(condition, AffineValue) or prod(condition.shape) != 1 or n > GATHERED:
         return None
     flat: list[Affine] = []
     for branch in reversed(branches):
-        affine = branch.affine if isinstance(branch, Value) else Affine(np.asarray(branch), {})
+        affine = branch.affine if isinstance(branch, AffineValue) else Affine(np.asarray(branch), {})
         if affine is None:
             return None
         flat.append(affine.spread(shape).picked(np.arange(n)))
@@ -91,19 +91,19 @@ def wide(reading: Reading, operands: list[Operand], shape: Shape) -> Value | Non
 
 
 # ---------------------------------------------------------------------- operands
-def narrowed(reading: Reading, op: str, operands: list[Operand], shape: Shape) -> list[Operand]:
+def narrowed(reading: GraphReading, op: str, operands: list[Operand], shape: Shape) -> list[Operand]:
     """The operands without the axes of length one, and without the copies, that the operator makes itself."""
     if op not in BROADCASTING:
         return operands
     found = list(operands)
     for place, operand in enumerate(found):
         others = [o.shape for i, o in enumerate(found) if i != place and o is not None]
-        if isinstance(operand, Value) and operand.affine is not None and others:
+        if isinstance(operand, AffineValue) and operand.affine is not None and others:
             found[place] = _narrow(reading, operand, operand.affine, np.broadcast_shapes(*others), shape)
     return found
 
 
-def _narrow(reading: Reading, operand: Value, affine: Affine, others: Shape, shape: Shape) -> Value:
+def _narrow(reading: GraphReading, operand: AffineValue, affine: Affine, others: Shape, shape: Shape) -> AffineValue:
     """One operand beside others that broadcast to a shape."""
     if affine.shape == shape == others and affine.constant.size > 1:
         first = affine.picked(np.zeros((1,) * len(shape), dtype=int))
@@ -114,7 +114,7 @@ def _narrow(reading: Reading, operand: Value, affine: Affine, others: Shape, sha
     origin = operand.origin
     if origin is not None and origin.op in ("Unsqueeze", "Reshape") and len(others) == len(shape):
         bare = origin.operands[0]
-        if isinstance(bare, Value):
+        if isinstance(bare, AffineValue):
             ones = len(operand.shape) - len(bare.shape)
             if ones > 0 and operand.shape == (1,) * ones + bare.shape:
                 return bare
@@ -122,14 +122,16 @@ def _narrow(reading: Reading, operand: Value, affine: Affine, others: Shape, sha
 
 
 def without_factors(
-    reading: Reading, op: str, operands: list[Operand], shape: Shape
+    reading: GraphReading, op: str, operands: list[Operand], shape: Shape
 ) -> tuple[list[Operand], Array | None]:
     """The operands of a Mul or a Div without constant factors, and the factor of the result, None without any."""
     if prod(shape) ** 2 > DENSE:
         return operands, None
     found, factor, changed = list(operands), np.ones(shape), False
     for place, operand in enumerate(operands):
-        stripped = _stripped(operand.affine) if isinstance(operand, Value) and operand.affine is not None else None
+        stripped = (
+            _stripped(operand.affine) if isinstance(operand, AffineValue) and operand.affine is not None else None
+        )
         if stripped is not None:
             changed = True
             found[place] = reading.value(stripped[0])
@@ -153,10 +155,15 @@ def _stripped(affine: Affine) -> tuple[Affine, Array] | None:
 
 
 # ---------------------------------------------------------------------- MatMul
-def by_vector(reading: Reading, operands: list[Operand], shape: Shape) -> Value | None:
+def by_vector(reading: GraphReading, operands: list[Operand], shape: Shape) -> AffineValue | None:
     """The product of a matrix and a vector that was made a row or a column for it, by the vector itself."""
     left, right = operands
-    if not isinstance(left, Value) or not isinstance(right, Value) or len(left.shape) != 2 or len(right.shape) != 2:
+    if (
+        not isinstance(left, AffineValue)
+        or not isinstance(right, AffineValue)
+        or len(left.shape) != 2
+        or len(right.shape) != 2
+    ):
         return None
     row, column = _vector(left, (1, left.shape[1])), _vector(right, (right.shape[0], 1))
     if (row is None) == (column is None):
@@ -169,18 +176,18 @@ def by_vector(reading: Reading, operands: list[Operand], shape: Shape) -> Value 
     return None if spread is None else reading.value(spread, Origin("Reshape", [product, np.array(shape)], {}, [shape]))
 
 
-def _vector(value: Value, shape: Shape) -> Value | None:
+def _vector(value: AffineValue, shape: Shape) -> AffineValue | None:
     """The vector that stands behind a row or a column of this shape."""
     origin = value.origin
     if value.shape != shape or origin is None or origin.op not in ("Unsqueeze", "Reshape"):
         return None
     bare = origin.operands[0]
-    return bare if isinstance(bare, Value) and len(bare.shape) == 1 else None
+    return bare if isinstance(bare, AffineValue) and len(bare.shape) == 1 else None
 
 
 # ---------------------------------------------------------------------- Min
 def clipped(
-    reading: Reading, operands: list[Operand], attributes: Attributes, shape: Shape
+    reading: GraphReading, operands: list[Operand], attributes: Attributes, shape: Shape
 ) -> tuple[str, list[Operand], Attributes]:
     """Min(Max(x, low), high) with one finite number each as a Clip, which passes on what is not a number as well."""
     unchanged = "Min", operands, attributes
@@ -195,16 +202,16 @@ def clipped(
     return "Clip", [inner[0], np.array(inner[1]), np.array(high)], {}
 
 
-def _floor(block: Block) -> tuple[Value, float] | None:
+def _floor(block: Block) -> tuple[AffineValue, float] | None:
     """The value and the number of a block that is max(value, number)."""
     if block.op == "Relu":
-        return (block.operands[0], 0.0) if isinstance(block.operands[0], Value) else None
+        return (block.operands[0], 0.0) if isinstance(block.operands[0], AffineValue) else None
     return _bound(block.operands) if block.op == "Max" else None
 
 
-def _bound(operands: list[Operand]) -> tuple[Value, float] | None:
+def _bound(operands: list[Operand]) -> tuple[AffineValue, float] | None:
     """The value and the number of a Max or Min of a value and one finite number."""
-    values = [o for o in operands if isinstance(o, Value)]
+    values = [o for o in operands if isinstance(o, AffineValue)]
     constants = [o for o in operands if isinstance(o, np.ndarray)]
     if len(values) != 1 or len(constants) != 1 or constants[0].size == 0:
         return None
@@ -219,7 +226,7 @@ RISKS = frozenset({"Div", "Log", "Exp", "Pow", "Sqrt", "Reciprocal", "Tan"})
 GUARDS = frozenset({"Where", "Clip", "Min", "Max", "Tanh", "Sigmoid", "Softmax", "Sign"})
 
 
-class Reading:
+class GraphReading:
     """The graph, read. ``price_before`` is what its operators cost [ns]; without ``factors`` products keep theirs.
 
     ``without_factors`` says whether any product had one to lose, so that the two readings may differ.
@@ -231,11 +238,11 @@ class Reading:
         self._shapes = {name: v.shape for name, v in found.items()}
         self._types = {OWN: DOUBLE, **{name: v.dtype for name, v in found.items()}}
         self._factors, self.without_factors = factors, False
-        self._known: dict[Any, Value] = {}
-        self._computed: dict[Any, list[Value]] = {}
+        self._known: dict[Any, AffineValue] = {}
+        self._computed: dict[Any, list[AffineValue]] = {}
         self._sliced: set[str] = set()
         self.blocks: list[Block] = []
-        self.values: list[Value] = []
+        self.values: list[AffineValue] = []
         self.price_before = 0.0
         self.names: dict[str, Operand] = {"": None}
         for tensor in graph.initializer:
@@ -247,16 +254,16 @@ class Reading:
         self.outputs = [(o.name, self.names[o.name]) for o in graph.output]
 
     # ------------------------------------------------------------------ values
-    def value(self, affine: Affine, origin: Origin | None = None) -> Value:
+    def value(self, affine: Affine, origin: Origin | None = None) -> AffineValue:
         """The value of an affine function, the same for equal functions."""
         key = affine.key()
         if key not in self._known:
             level = max((self.blocks[b].level for b in affine.parts), default=-1)
-            self._known[key] = Value(len(self.values), affine.shape, level, affine, None, origin)
+            self._known[key] = AffineValue(len(self.values), affine.shape, level, affine, None, origin)
             self.values.append(self._known[key])
         return self._known[key]
 
-    def risky(self, value: Value) -> bool:
+    def risky(self, value: AffineValue) -> bool:
         """Whether a value may be infinite or no number while the inputs are finite."""
         if value.affine is None:
             return value.block is not None and value.block.risky
@@ -267,11 +274,11 @@ class Reading:
         self.blocks.append(block)
         return block
 
-    def _of_block(self, block: Block) -> Value:
+    def _of_block(self, block: Block) -> AffineValue:
         """The value that is a block."""
         if self._types[block.name] == DOUBLE and 0 < prod(block.shape) ** 2 <= DENSE:
             return self.value(Affine.block(block.number, block.shape))
-        value = Value(len(self.values), block.shape, block.level, None, block)
+        value = AffineValue(len(self.values), block.shape, block.level, None, block)
         self.values.append(value)
         return value
 
@@ -294,16 +301,16 @@ class Reading:
 
     def _affine(
         self, op: str, attributes: Attributes, operands: list[Operand], names: list[str], shapes: list[Shape]
-    ) -> list[Value] | None:
+    ) -> list[AffineValue] | None:
         """The outputs of an operator as affine functions; None where they are not, or have too large matrices."""
         if any(self._types[n] != DOUBLE for n in names):
             return None
         if op == "Where":
             switched = reading.switched(self, operands, shapes[0])
             return None if switched is None else [switched]
-        if any(isinstance(o, Value) and o.affine is None for o in operands):
+        if any(isinstance(o, AffineValue) and o.affine is None for o in operands):
             return None
-        arguments = [o.affine if isinstance(o, Value) else o for o in operands]
+        arguments = [o.affine if isinstance(o, AffineValue) else o for o in operands]
         blocks = {b: len(m) for a in arguments if isinstance(a, Affine) for b, m in a.parts.items()}
         if not blocks or sum(blocks.values()) * max(map(prod, shapes)) > DENSE:
             return None
@@ -314,7 +321,7 @@ class Reading:
 
     def computed(
         self, op: str, attributes: Attributes, operands: list[Operand], names: list[str], shapes: list[Shape]
-    ) -> list[Value]:
+    ) -> list[AffineValue]:
         """The outputs of an operator that is computed as it stands, the same for equal ones."""
         factor: Array | None = None
         operands = reading.narrowed(self, op, operands, shapes[0])
@@ -340,9 +347,9 @@ class Reading:
 
     def _made(
         self, op: str, attributes: Attributes, operands: list[Operand], names: list[str], shapes: list[Shape]
-    ) -> list[Value]:
+    ) -> list[AffineValue]:
         """New blocks."""
-        used = [o for o in operands if isinstance(o, Value)]
+        used = [o for o in operands if isinstance(o, AffineValue)]
         level = 1 + max((v.level for v in used), default=-1)
         given = [intervals.interval(o, self.blocks) for o in operands]
         risky = op in RISKS and not intervals.finite(op, given)
@@ -360,6 +367,6 @@ class Reading:
 def _key(operand: Operand) -> Any:
     if operand is None:
         return None
-    if isinstance(operand, Value):
+    if isinstance(operand, AffineValue):
         return operand.number
     return (operand.dtype.str, operand.shape, operand.tobytes())

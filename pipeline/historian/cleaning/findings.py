@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from loopwright.pipeline.historian.cleaning.sampling import Sampling
+from loopwright.pipeline.historian.cleaning.sampling import TagSampling
 from loopwright.pipeline.records.old_loops import OldController, Operated
 
 
@@ -39,7 +39,7 @@ class TagReport:
     rows_lost: dict[str, int]
     rows_bridged: int
     step: float  # of the converter or of the export's digits; 0 where there is none
-    sampling: Sampling
+    sampling: TagSampling
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ class InputReport:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class RecordJudgement:
     """Whether the record can carry a model: yes, doubtful or no, and the reasons."""
 
     carries: str
@@ -105,7 +105,7 @@ class Screening:
     tags: tuple[TagReport, ...]
     modes: dict[str, dict[str, int]]  # mode tag -> mode -> rows
     findings: tuple[Finding, ...]
-    verdict: Verdict
+    verdict: RecordJudgement
     zone: str = ""  # that dates are in, as in Export
     operated: tuple[Operated, ...] = ()  # how the loops were run whose set point is known
     old_controllers: tuple[OldController, ...] = ()  # the law of each of them, as the record shows it

@@ -10,12 +10,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.config.exports import Interval
+from loopwright.pipeline.config.exports import TimeSpan
 from loopwright.pipeline.errors import RecordError, nearest
 from loopwright.pipeline.historian.cleaning.findings import Finding, counted
-from loopwright.pipeline.historian.cleaning.grid import Grid
 from loopwright.pipeline.historian.cleaning.outliers_and_units import usual
-from loopwright.pipeline.historian.cleaning.sampling import Sampling
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
+from loopwright.pipeline.historian.cleaning.sampling import TagSampling
 from loopwright.pipeline.historian.cleaning.tag_checks import VALVE_RANGE
 from loopwright.pipeline.historian.cleaning.tags import GUESSED_PAD, KEEP, Tag
 from loopwright.pipeline.historian.files.export import Export, Series
@@ -91,7 +91,7 @@ def spans_of(texts: Iterable[str], export: Export) -> list[Span]:
     found = []
     for text in texts:
         try:
-            interval = Interval.of(text)
+            interval = TimeSpan.of(text)
         except ValueError as error:
             raise RecordError(f"leave_out: {error}") from None
         found.append((_seconds(interval.first, text, export, first_s), _seconds(interval.end, text, export, first_s)))
@@ -156,7 +156,7 @@ SHORTEST_RUN = 20  # rows
 PAD = 0.1  # of the span, beyond the values seen, in a range that was not given
 
 
-def stretches(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, Sampling]) -> list[Finding]:
+def mask_stuck_and_saturated(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, TagSampling]) -> list[Finding]:
     """Mask stuck and saturated rows of PVs and measured disturbances; changes the grid's codes in place.
 
     A tag that is stored by exception repeats its value on purpose: it is neither.

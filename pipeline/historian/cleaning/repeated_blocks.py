@@ -22,7 +22,7 @@ DIFFERENT = 16  # changes of the value among them
 FACTOR = 0x9E3779B97F4A7C15  # of the hash of a block: 2^64 over the golden ratio, which spreads keys evenly
 
 
-def drop_copies(own: Mapping[str, Series], tags: Sequence[Tag]) -> list[Finding]:
+def flag_copies(own: Mapping[str, Series], tags: Sequence[Tag]) -> list[Finding]:
     """Readings of PVs that repeat a block of earlier ones get their reason; the first of each stays.
 
     A value with noise larger than its converter's step does not repeat by chance. For a coarser PV the whole row must

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.cleaning.findings import Finding, counted
-from loopwright.pipeline.historian.cleaning.grid import Grid
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import runs_of
@@ -32,7 +32,7 @@ WORDS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Windows:
+class MotionWindows:
     """First rows (m,) of windows of ``length`` rows, and of each: the motions, their correlation, what is expected."""
 
     length: int
@@ -45,7 +45,7 @@ class Windows:
     high: Array
 
     @classmethod
-    def of(cls, y: Array, expected: Array, length: int) -> Windows:
+    def of(cls, y: Array, expected: Array, length: int) -> MotionWindows:
         """From a PV y (n,) and its expected values (n,); windows with too many gaps are left out."""
         part = max(length // STEPS, 1)
         m = len(y) // part
@@ -90,7 +90,7 @@ def contradict(
         if tag.tag in grid.limits:
             y[grid.limits[tag.tag]] = np.nan  # there it answers to nothing by right
         length = int(np.clip(SETTLINGS * settling.get(tag.tag, 0), SHORTEST, LONGEST))
-        windows = Windows.of(y, expected[tag.tag], length)
+        windows = MotionWindows.of(y, expected[tag.tag], length)
         for kind, rows in _judged(windows, len(y)).items():
             if kind == "no cause":
                 rows = _with_its_rest(rows, [grid.value[t.tag] for t in signals if t.role == "mv"])
@@ -136,7 +136,7 @@ def _reach(far: NDArray[np.bool_]) -> int:
     return int(last[-1]) + 1 if last.size else 0
 
 
-def _judged(w: Windows, n: int) -> dict[str, NDArray[np.bool_]]:
+def _judged(w: MotionWindows, n: int) -> dict[str, NDArray[np.bool_]]:
     """Rows (n,) by kind; none where the inputs explain the PV badly, or too many rows are struck."""
     if len(w.start) < 2 * OTHERS:
         return {}
@@ -162,7 +162,7 @@ def _judged(w: Windows, n: int) -> dict[str, NDArray[np.bool_]]:
     return found if struck.mean() <= MOST else {}
 
 
-def _explained_elsewhere(w: Windows, i: int) -> bool:
+def _explained_elsewhere(w: MotionWindows, i: int) -> bool:
     """Whether windows that expect the same values, and do not overlap this one, are explained well."""
     span = max(float(w.high[i] - w.low[i]), 1e-300)
     covered = (np.minimum(w.high, w.high[i]) - np.maximum(w.low, w.low[i])) / span

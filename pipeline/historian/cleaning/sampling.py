@@ -138,7 +138,7 @@ FINEST = 1e-3  # of the median step: an archive's scan
 
 
 @dataclass(frozen=True, slots=True)
-class Sampling:
+class TagSampling:
     """How one tag was sampled, and over what time a reading is held or a line drawn between two."""
 
     tag: str
@@ -148,7 +148,7 @@ class Sampling:
     hold_s: float  # [s]
 
 
-def sampling(series: Series, period_s: float | None = None, hold_s: float | None = None) -> Sampling:
+def sampling(series: Series, period_s: float | None = None, hold_s: float | None = None) -> TagSampling:
     """Median step of a tag, whether it reports by exception, and its hold [s] unless ``hold_s`` states it.
 
     Without a stated one, three steps of a tag sampled regularly; of one that reports by exception, twice the 99 %
@@ -158,14 +158,14 @@ def sampling(series: Series, period_s: float | None = None, hold_s: float | None
     step = np.diff(stamps)
     step = step[step > 0]
     if not step.size:
-        return Sampling(series.tag, 0.0, False, False, hold_s or HOLD_PERIODS * (period_s or 1.0))
+        return TagSampling(series.tag, 0.0, False, False, hold_s or HOLD_PERIODS * (period_s or 1.0))
     low, median, high = np.quantile(step[:: max(1, len(step) // 200_000)], [0.1, 0.5, 0.9])
     irregular = bool(high > IRREGULAR * low) and not keeps_time(stamps)
     own = 2.0 * float(np.quantile(step, 0.99)) if irregular else HOLD_PERIODS * float(median)
     stored = series.time_s[series.good], series.value[series.good]
     band = irregular and len(stored[0]) > 1 and _is_held(np.diff(stored[0]), stored[1])
     band = series.between == "step" or (band and not series.between)
-    return Sampling(series.tag, float(median), irregular, band, hold_s or max(own, HOLD_PERIODS * (period_s or 0.0)))
+    return TagSampling(series.tag, float(median), irregular, band, hold_s or max(own, HOLD_PERIODS * (period_s or 0.0)))
 
 
 def _is_held(step: Array, values: Array) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.cleaning.findings import Finding, Verdict, counted
+from loopwright.pipeline.historian.cleaning.findings import Finding, RecordJudgement, counted
 from loopwright.pipeline.historian.cleaning.outliers_and_units import core, outliers, slips_of, usual
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.files.dialect import COMMA_DECIMAL, POINT_DECIMAL
@@ -110,7 +110,7 @@ ONE_SIDE, END_SHARE = 0.9, 0.25  # of the texts, or of the readings beside them,
 MOSTLY = 0.5  # of the readings outside the given range: then the range or its unit is wrong
 
 
-def clean(series: Series, tag: Tag) -> list[Finding]:
+def flag_bad_readings(series: Series, tag: Tag) -> list[Finding]:
     """Give every bad reading of one tag its reason; what was found."""
     found = []
     counts = series.counts()
@@ -180,7 +180,7 @@ def text_side(series: Series) -> str:
     return share[1] if share[0] >= ONE_SIDE else ""
 
 
-def with_texts_of_one_side(verdict: Verdict, findings: Sequence[Finding]) -> Verdict:
+def with_texts_of_one_side(verdict: RecordJudgement, findings: Sequence[Finding]) -> RecordJudgement:
     """The verdict, "doubtful" at best where one end of a tag's readings was refused as text."""
     tags = [f.tag for f in findings if f.kind == ONE_SIDED]
     if not tags:

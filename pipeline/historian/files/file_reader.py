@@ -18,7 +18,7 @@ from loopwright.pipeline.errors import RecordError, nearest
 from loopwright.pipeline.files import sha256
 from loopwright.pipeline.historian.files.date_forms import DAY_S
 from loopwright.pipeline.historian.files.export import Contents, Export, Note, Series, joined
-from loopwright.pipeline.historian.files.gathering import Gathered, drop_repeated_rows
+from loopwright.pipeline.historian.files.gathering import Gathered, flag_repeated_rows
 from loopwright.pipeline.historian.files.headers import tag_named, tags_of
 from loopwright.pipeline.historian.files.layout import Layout, clocks_apart
 from loopwright.pipeline.historian.files.open_file import EncodingError, Opened, opened
@@ -40,7 +40,7 @@ def read_export(
     """
     if not paths:
         raise RecordError("no file is named; give one or more exports")
-    times = Times(time_column, time_format, time_zone, zone_named(time_zone) if time_zone else None)
+    times = StatedTimes(time_column, time_format, time_zone, zone_named(time_zone) if time_zone else None)
     sources = [opened(path) for path in paths]
     columns = {column: tag for source in sources for column, tag in tags_of(source.header).items()}
     tags, modes = [tag_named(t, columns) for t in tags], [tag_named(t, columns) for t in modes]
@@ -79,7 +79,7 @@ def read_export(
 
 
 @dataclass(frozen=True, slots=True)
-class Times:
+class StatedTimes:
     """A person's statements on the times: their column, their form, their zone; "" and None without one."""
 
     column: str
@@ -102,14 +102,14 @@ class FileRead:
     local: bool  # some of its times were converted from the zone that a person named
 
 
-def _of_file(source: Opened, times: Times, wanted: set[str], modes: set[str]) -> FileRead:
+def _of_file(source: Opened, times: StatedTimes, wanted: set[str], modes: set[str]) -> FileRead:
     try:
         return _of_opened(source, times, wanted, modes)
     except EncodingError as error:
         return _of_opened(opened(source.path, error.encoding), times, wanted, modes)
 
 
-def _of_opened(source: Opened, times: Times, wanted: set[str], modes: set[str]) -> FileRead:
+def _of_opened(source: Opened, times: StatedTimes, wanted: set[str], modes: set[str]) -> FileRead:
     layout = source.layout(times.column, times.form)
     apart = clocks_apart(layout, source.header)
     found, counts, notes, zones, local = dict[str, Series](), Counter[str](), [*source.notes], list[str](), False
@@ -122,7 +122,7 @@ def _of_opened(source: Opened, times: Times, wanted: set[str], modes: set[str]) 
         notes += [*own.notes, *more]
         zones.append(IN_UTC if clock else zone)
         local |= clock is not None
-    drop_repeated_rows(found)
+    flag_repeated_rows(found)
     pa.default_memory_pool().release_unused()
     known = set(found) if layout.kind == "long" else {own.tags[v] for own in apart for v in own.values}
     contents = _contents(source.path, found, counts["rows_read"])

@@ -21,7 +21,7 @@ from loopwright.pipeline.metrics import Array
 FACTOR = np.uint64(0x9E3779B97F4A7C15)
 
 
-def drop_repeated_rows(series: Mapping[str, Series]) -> None:
+def flag_repeated_rows(series: Mapping[str, Series]) -> None:
     """Rows of one file that stand there again, stamp and all values, become DUPLICATE; the first of each stays.
 
     Tags with the same stamps share rows. Only where nearly all rows that share a stamp are equal, in every tag:

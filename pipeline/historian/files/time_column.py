@@ -14,7 +14,7 @@ from loopwright.pipeline.errors import RecordError, nearest
 from loopwright.pipeline.historian.files.date_forms import DAY_S, HOUR, HOUR_DIGITS, UnclearCountError
 from loopwright.pipeline.historian.files.headers import split_header, time_header
 from loopwright.pipeline.historian.files.table_head import kind_of_cell
-from loopwright.pipeline.historian.files.time_stamps import SINCE_1970_S, Clock, clock_of, given_clock
+from loopwright.pipeline.historian.files.time_stamps import SINCE_1970_S, TimeForm, clock_of, given_clock
 from loopwright.pipeline.metrics import Array
 
 SAMPLE = 200  # cells of a column
@@ -26,10 +26,10 @@ class TimeColumn:
     """The column of times and how it writes them; ``before`` it stand those of the day, or of year to minute."""
 
     name: str
-    clock: Clock
+    clock: TimeForm
     before: tuple[str, ...] = ()
     left: str = ""  # for a person: which others could have been it
-    others: tuple[tuple[str, Clock], ...] = ()  # further columns of dates that rise
+    others: tuple[tuple[str, TimeForm], ...] = ()  # further columns of dates that rise
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -38,11 +38,11 @@ class TimeColumn:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class TimeCandidate:
     """A column that may be time, by its name and first cells."""
 
     column: str
-    clock: Clock
+    clock: TimeForm
     rank: int  # of its name, as in TimeHeader
     rises: bool  # or falls
     stands: bool  # one value in all rows
@@ -77,7 +77,7 @@ def time_column_of(
         if pair := _day_and_hour(header, sample):
             return TimeColumn(pair[1], clock, pair[:1])
         return TimeColumn(_fitting(path, header, sample, clock), clock)
-    found, refused = list[Candidate](), list[tuple[int, RecordError]]()
+    found, refused = list[TimeCandidate](), list[tuple[int, RecordError]]()
     for column in header:
         try:
             candidate = _candidate(path, column, sample.get(column, ())[:SAMPLE], units.get(column, ""), spread)
@@ -88,7 +88,7 @@ def time_column_of(
             found.append(candidate)
     best = min(found, key=lambda c: c.order, default=None)
     if (best is None or not best.clock.dates) and (parts := _year_to_second(header, sample)):
-        return TimeColumn(parts[-1], Clock("format", format=" ".join(FORMS[: len(parts)])), parts[:-1])
+        return TimeColumn(parts[-1], TimeForm("format", format=" ".join(FORMS[: len(parts)])), parts[:-1])
     pair = _day_and_hour(header, sample)
     if pair and (best is None or best.column in pair or not best.clock.dates):
         return _paired(path, sample, *pair, spread)
@@ -110,7 +110,7 @@ def time_column_of(
 
 def _candidate(
     path: Path, column: str, cells: Sequence[Any], unit: str, spread: Callable[[str], Sequence[Any]]
-) -> Candidate | None:
+) -> TimeCandidate | None:
     """The column as one of times; None where it holds none, or its name is vague and it does not rise."""
     header = time_header(column)
     where = f"{path}: column {column!r}"
@@ -130,7 +130,7 @@ def _candidate(
     if not clock.dates and header.rank >= 2 and (not rises or stands):
         return None
     first_s = float(seconds[np.isfinite(seconds)][0]) if np.isfinite(seconds).any() else 0.0
-    return Candidate(column, clock, header.rank, rises, stands, first_s)
+    return TimeCandidate(column, clock, header.rank, rises, stands, first_s)
 
 
 def _way(seconds: Array) -> tuple[bool, bool]:
@@ -141,7 +141,7 @@ def _way(seconds: Array) -> tuple[bool, bool]:
     return rises, bool(len(steps)) and not steps.any()
 
 
-def seconds_of(clock: Clock, cells: Sequence[Any]) -> Array:
+def seconds_of(clock: TimeForm, cells: Sequence[Any]) -> Array:
     """Seconds (n,) of cells (n,) by a clock; NaN where one cannot be read."""
     try:
         return clock.seconds(pa.array(list(cells)))
@@ -181,7 +181,7 @@ def _named(
     return TimeColumn(column, clock)
 
 
-def _fitting(path: Path, header: Sequence[str], sample: Mapping[str, Sequence[Any]], clock: Clock) -> str:
+def _fitting(path: Path, header: Sequence[str], sample: Mapping[str, Sequence[Any]], clock: TimeForm) -> str:
     """The column that a given form reads: most cells, and the best name."""
     found = []
     for column in header:
@@ -241,17 +241,17 @@ def _may_be_hours(column: str) -> bool:
     return header.named and header.factor is None
 
 
-def _quiet(column: str, cells: Sequence[str]) -> Clock | None:
+def _quiet(column: str, cells: Sequence[str]) -> TimeForm | None:
     """The clock of a column of days; one whose day and month cannot be told apart is a column of days too."""
     try:
         return clock_of(column, cells[:SAMPLE], column)
     except RecordError:
-        return Clock("iso")
+        return TimeForm("iso")
 
 
 def _clock_by_all(
     name: str, cells: Sequence[Any], where: str, unit: str, more: Callable[[], Sequence[Any]]
-) -> Clock | None:
+) -> TimeForm | None:
     """The clock by the first cells, or by more of them where these cannot be told to be one thing or another."""
     try:
         return clock_of(name, cells, where, unit)

@@ -166,7 +166,7 @@ SERIAL_UNIT = "serial"
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class TimeForm:
     """How one column writes time: ``iso``, ``number`` (seconds = scale x value - start_s), ``elapsed`` or a ``format``.
 
     ``elapsed`` is 26:03:10 since some start. ``says`` is what was taken for granted, for a person; empty where all is
@@ -204,7 +204,9 @@ class Clock:
         return _iso(column) if self.kind == "iso" else _formatted(column, self.format)
 
 
-def clock_of(name: str, sample: Sequence[Any], where: str, unit: str = "", *, everywhere: bool = False) -> Clock | None:
+def clock_of(
+    name: str, sample: Sequence[Any], where: str, unit: str = "", *, everywhere: bool = False
+) -> TimeForm | None:
     """The clock of a column by its name and first cells (texts or numbers); None where they are no times.
 
     ``unit`` is what a row below the header says. Cells from ``everywhere`` in a column are no neighbours. RecordError
@@ -221,25 +223,25 @@ def clock_of(name: str, sample: Sequence[Any], where: str, unit: str = "", *, ev
         values = np.array([float(t.replace(",", ".")) for t in texts])
         return _numeric(header, values, where, unit, everywhere=everywhere) if header.named else None
     if _most(texts, ISO):
-        return Clock("iso")
+        return TimeForm("iso")
     if form := form_of(texts, where):
-        return Clock("format", format=form)
+        return TimeForm("format", format=form)
     if header.named and _most(texts, ELAPSED):
-        return Clock("elapsed", says="hours, minutes and seconds without a date")
+        return TimeForm("elapsed", says="hours, minutes and seconds without a date")
     return None
 
 
-def given_clock(form: str) -> Clock:
+def given_clock(form: str) -> TimeForm:
     """The clock of a form that a person gave: as of strptime, or a unit of numbers (ms, s, min, h, d, serial)."""
     if form.lower() == SERIAL_UNIT:
-        return Clock("number", DAY_S, SERIAL.at_1970 * DAY_S)
+        return TimeForm("number", DAY_S, SERIAL.at_1970 * DAY_S)
     if form.lower() in TIME_UNITS:
-        return Clock("number", TIME_UNITS[form.lower()])
+        return TimeForm("number", TIME_UNITS[form.lower()])
     if "%" not in form:
         raise RecordError(
             f"--time-format {form}: write a form as in '%d.%m.%Y %H:%M:%S', or a unit of numbers: {allowed_units()}"
         )
-    return Clock("format", format=form)
+    return TimeForm("format", format=form)
 
 
 def allowed_units() -> str:
@@ -247,7 +249,7 @@ def allowed_units() -> str:
     return ", ".join((*SPELLINGS, SERIAL_UNIT))
 
 
-def zone_of(clock: Clock, sample: Sequence[Any]) -> str:
+def zone_of(clock: TimeForm, sample: Sequence[Any]) -> str:
     """The zone that a clock's seconds count in, by the first cells: UTC, or UNSTATED; "" where they are no dates."""
     cells = [c for c in sample if c is not None and str(c).strip() != ""]
     if not cells or clock.kind == "elapsed":
@@ -266,7 +268,7 @@ def _most(texts: Sequence[str], pattern: re.Pattern[str]) -> bool:
     return 2 * sum(bool(pattern.match(t)) for t in texts) > len(texts)
 
 
-def _numeric(header: TimeHeader, values: Array, where: str, unit: str, *, everywhere: bool) -> Clock:
+def _numeric(header: TimeHeader, values: Array, where: str, unit: str, *, everywhere: bool) -> TimeForm:
     factor, unit = header.factor, "" if unit.strip().lower() in NO_UNITS else unit
     if factor is None and unit:
         factor = TIME_UNITS.get(unit.strip().lower().rstrip("."))
@@ -286,19 +288,19 @@ def _numeric(header: TimeHeader, values: Array, where: str, unit: str, *, everyw
             f"--time-format {SERIAL_UNIT}"
         ) from None
     if days is not None:
-        return Clock("number", DAY_S, days.at_1970 * DAY_S, says=f"numbers are {days.words}")
+        return TimeForm("number", DAY_S, days.at_1970 * DAY_S, says=f"numbers are {days.words}")
     if factor is not None and factor != 1.0:
-        return Clock("number", factor)
+        return TimeForm("number", factor)
     if factor is None and (form := calendar_digits(values.tolist(), days=header.date)):
-        return Clock("format", format=form)
+        return TimeForm("format", format=form)
     for low, high, start_s in TICKS:
         if low < size < high:
-            return Clock("number", 1e-7, start_s, says="numbers are ticks of 100 ns")
+            return TimeForm("number", 1e-7, start_s, says="numbers are ticks of 100 ns")
     # Seconds since 1970 have ten digits, milliseconds thirteen.
     scale = 1.0 if size < 1e11 else 1e-3 if size < 1e14 else 1e-6 if size < 1e17 else 1e-9
     assumed = factor is None and size < SINCE_1970_S
     says = "numbers are taken as seconds, no unit is written; --time-format names another, as in --time-format min"
-    return Clock("number", scale, says=says if assumed else "", certain=not assumed)
+    return TimeForm("number", scale, says=says if assumed else "", certain=not assumed)
 
 
 def _formatted(column: Any, form: str) -> Array:

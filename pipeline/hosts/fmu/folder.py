@@ -103,7 +103,7 @@ def page(controller: Controller) -> bytes:
 
 
 # ---------------------------------------------------------------------- variables in XML
-def _variables_2(root: Element, rows: list[Variable]) -> None:
+def _variables_2(root: Element, rows: list[ScalarVariable]) -> None:
     parent = SubElement(root, "ModelVariables")
     shown = [row for row in rows if row.causality != "independent"]  # FMI 2.0 needs none, and no tool a second time
     for row in shown:
@@ -119,7 +119,7 @@ def _variables_2(root: Element, rows: list[Variable]) -> None:
             SubElement(initial, "Unknown", index=index[row.reference], dependencies=" ".join(before))
 
 
-def _variables_3(root: Element, rows: list[Variable]) -> None:
+def _variables_3(root: Element, rows: list[ScalarVariable]) -> None:
     parent, structure = SubElement(root, "ModelVariables"), SubElement(root, "ModelStructure")
     for row in rows:
         SubElement(parent, "Boolean" if row.boolean else "Float64", _common(row) | _numbers(row))
@@ -131,19 +131,19 @@ def _variables_3(root: Element, rows: list[Variable]) -> None:
         SubElement(structure, "InitialUnknown", valueReference=str(row.reference), dependencies=before)
 
 
-def _start_of(output: Variable, rows: list[Variable]) -> list[Variable]:
+def _start_of(output: ScalarVariable, rows: list[ScalarVariable]) -> list[ScalarVariable]:
     """The parameter that an output begins with, if it is an MV."""
     name = output.name.removeprefix("mv.")
     return [r for r in rows if output.group == "mv" and r.group == "mv_start" and r.name == f"mv_start.{name}"]
 
 
-def _common(row: Variable) -> dict[str, str]:
+def _common(row: ScalarVariable) -> dict[str, str]:
     varies = {"output": "discrete", "parameter": "fixed"}.get(row.causality, "continuous")
     found = {"name": row.name, "valueReference": str(row.reference), "causality": row.causality, "variability": varies}
     return found | {"description": row.words} | ({"initial": "calculated"} if row.causality == "output" else {})
 
 
-def _numbers(row: Variable) -> dict[str, str]:
+def _numbers(row: ScalarVariable) -> dict[str, str]:
     found = {"unit": row.unit} if row.unit else {}
     if row.low is not None and row.high is not None:
         found |= {"min": repr(row.low), "max": repr(row.high)}
@@ -224,7 +224,7 @@ NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]
 
 
 @dataclass(frozen=True, slots=True)
-class Variable:
+class ScalarVariable:
     """A scalar variable. ``group``: sp, pv, dv, mv_applied, mv_start, mv, info; time, fault or use_mv_applied.
 
     ``low``, ``high`` and ``start`` are None where there is none.
@@ -246,15 +246,15 @@ class Variable:
         return self.reference in (FAULT, USE_APPLIED)
 
 
-def variables_of(m: Manifest) -> list[Variable]:
+def variables_of(m: Manifest) -> list[ScalarVariable]:
     """All variables; HostError where two would have one name, or a name has characters that XML does not have."""
     rows = [
-        Variable("time", TIME, "time", "independent", "simulation time", "s"),
-        Variable("fault", FAULT, "fault", "output", "the last sample was refused: its MV is the one before"),
+        ScalarVariable("time", TIME, "time", "independent", "simulation time", "s"),
+        ScalarVariable("fault", FAULT, "fault", "output", "the last sample was refused: its MV is the one before"),
     ]
     if "mv_applied" in m.inputs:
         words = "whether mv_applied is read once it is set; otherwise its place takes the last mv"
-        rows.append(Variable("use_mv_applied", USE_APPLIED, "use_mv_applied", "parameter", words, start=True))
+        rows.append(ScalarVariable("use_mv_applied", USE_APPLIED, "use_mv_applied", "parameter", words, start=True))
     groups = [
         ("sp", "input", m.sp if "sp" in m.inputs else (), "set point"),
         ("pv", "input", m.pv if "pv" in m.inputs else (), "process variable"),
@@ -269,7 +269,9 @@ def variables_of(m: Manifest) -> list[Variable]:
             rows.append(_variable(s, reference, group, causality, words))
             reference += 1
     for name in m.info:
-        rows.append(Variable(in_xml(f"info.{name}"), reference, "info", "output", "of the law, for people and alarms"))
+        rows.append(
+            ScalarVariable(in_xml(f"info.{name}"), reference, "info", "output", "of the law, for people and alarms")
+        )
         reference += 1
     names = [row.name for row in rows]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -278,12 +280,12 @@ def variables_of(m: Manifest) -> list[Variable]:
     return rows
 
 
-def _variable(s: Signal, reference: int, group: str, causality: str, words: str) -> Variable:
+def _variable(s: Signal, reference: int, group: str, causality: str, words: str) -> ScalarVariable:
     if s.values is not None:
         words += f"; allowed: {', '.join(f'{value:g}' for value in s.values)}"
     start = None if causality == "output" else s.middle
     unit = "" if s.unit == "-" else in_xml(s.unit)
-    return Variable(in_xml(f"{group}.{s.name}"), reference, group, causality, words, unit, s.low, s.high, start)
+    return ScalarVariable(in_xml(f"{group}.{s.name}"), reference, group, causality, words, unit, s.low, s.high, start)
 
 
 def in_xml(text: str) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from loopwright.pipeline.errors import HostError
-from loopwright.pipeline.hosts.fmu.folder import Variable, variables_of
+from loopwright.pipeline.hosts.fmu.folder import ScalarVariable, variables_of
 from loopwright.pipeline.plants.fmu.description import described, fmpy
 from loopwright.pipeline.plants.fmu.instance import Instance
 from loopwright.serving.conformance.steps import answered
@@ -52,5 +52,5 @@ def problems(fmu: Path) -> list[str]:
     return list(validation.validate_fmu(str(fmu)))
 
 
-def _references(rows: list[Variable], group: str) -> list[int]:
+def _references(rows: list[ScalarVariable], group: str) -> list[int]:
     return [row.reference for row in rows if row.group == group]

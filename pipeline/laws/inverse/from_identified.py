@@ -31,7 +31,7 @@ NUDGE = 1e-4  # of the scaled state, and of the MV's range: for slopes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+class HorizonChoice:
     """A horizon and an observed PV, by the linearization x+ = A x + B u, y = C x of the model at a rest.
 
     S_h is the answer of the CV after h periods of a unit step. The law knows the PVs alone: p'y + s u is the best
@@ -99,7 +99,7 @@ def _calm(a: Array, b: Array, n_pv: int, horizons: Sequence[int]) -> int:
 
 
 def _radius(a: Array, b: Array, n_pv: int, h: int) -> float:
-    """Largest eigenvalue of A - B p' C / s, where p'y(k) + s u(k) predicts the CV after h periods; see ``Choice``."""
+    """Largest eigenvalue of A - B p' C / s, where p'y(k) + s u(k) predicts the CV in h periods (``HorizonChoice``)."""
     start = np.zeros((LANES, len(a)))
     runs = branches(lambda x, u: x @ a.T + np.outer(u, b), start, h)
     known = np.column_stack([runs.x[:, :n_pv], runs.u])
@@ -163,7 +163,7 @@ HIDDEN, ITERATIONS, TRAIN = (10,), 60, 0.8  # units, iterations, and the share o
 PARTITIONS = 10  # of the inverse
 
 
-def learnt_parts(model: Identified, signals: Signals, choice: Choice) -> dict[str, Model]:
+def learnt_parts(model: Identified, signals: Signals, choice: HorizonChoice) -> dict[str, Model]:
     """The parts ``forward``, ``observer`` and ``inverse``: of the CV over h, of the observed PV over one.
 
         forward(x(k), u) = y(k + h),   observer(x(k), u) = T(k + 1),   inverse(x, forward(x, u)) = u

@@ -13,7 +13,7 @@ from torch import Tensor
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_part, require_single_loop
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.static.leverage_domain import Interval, LeverageDomain
+from loopwright.pipeline.models.static.leverage_domain import DomainInterval, LeverageDomain
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 
 
@@ -80,13 +80,13 @@ class DomainLaw(ControlLaw):
             raise LawError(f"law {cls.name!r} needs a part 'domain' of kind leverage_domain; got {domain.kind}")
         return cls(signals, require_part(models, "inverse", cls.name, n_in, 1), domain, **asdict(params))
 
-    def within(self, sp: Tensor, pv: Tensor) -> tuple[Interval, Tensor, Tensor, Tensor]:
+    def within(self, sp: Tensor, pv: Tensor) -> tuple[DomainInterval, Tensor, Tensor, Tensor]:
         """The interval of requests at a state, its narrowed bounds, and the set point within them, (..., 1) each."""
         at = self.domain.interval(pv)
         low, high = self.domain.bounds(at, pv[..., :1], self.narrowing)
         return at, low, high, torch.minimum(torch.maximum(sp, low), high)
 
-    def shown(self, at: Interval, w: Tensor, low: Tensor, high: Tensor, *more: Tensor) -> Tensor:
+    def shown(self, at: DomainInterval, w: Tensor, low: Tensor, high: Tensor, *more: Tensor) -> Tensor:
         """Info of the request w (..., 1) that the network is given."""
         leverage = self.domain.leverage(at, w)
         return torch.cat([w, low, high, leverage, self.domain.inside(leverage), *more], dim=-1)

@@ -20,7 +20,7 @@ from loopwright.pipeline.laws.base import (
     require_part,
     require_single_loop,
 )
-from loopwright.pipeline.laws.inverse.from_identified import LONGEST, Choice, learnt_parts
+from loopwright.pipeline.laws.inverse.from_identified import LONGEST, HorizonChoice, learnt_parts
 from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
@@ -94,7 +94,7 @@ class ObserverLaw(ControlLaw):
 
         ``observer_gain`` L in (0, 1]; ``integral_gain`` ki >= 0 a sample; ``band`` [cv] the error below
         which the integral acts; ``horizon`` h in periods and ``observed``, the name of a PV: None lets the law
-        choose from the part ``identified``, see ``Choice``. Where the set has parts of the law's own, these state
+        choose from the part ``identified`` (``HorizonChoice``). Where the set has parts of the law's own, these state
         their horizon, and ``observed`` is the PV that part ``observer`` predicts, None for the last; ``mv_rate``
         [mv] the largest change a sample, None unlimited.
         """
@@ -117,7 +117,7 @@ class ObserverLaw(ControlLaw):
                 raise ValueError(f"horizon is {self.horizon}; give 1 to {LONGEST} periods, or leave it out")
 
     observes_within: ClassVar[int | None] = 1
-    choice: Choice | None = None
+    choice: HorizonChoice | None = None
     # In the order of the constructor's arguments.
     parts: ClassVar[Mapping[str, str]] = {"forward": "a network of task forward", "observer": ONE_PERIOD}
     span: Tensor
@@ -149,7 +149,7 @@ class ObserverLaw(ControlLaw):
         choice = None
         if cls.needs(params, models) == OWN_CHOICE:
             model = _model_of_all(models, signals, cls.name)
-            choice = Choice.of(model, signals, params.horizon, _place(params.observed, signals))
+            choice = HorizonChoice.of(model, signals, params.horizon, _place(params.observed, signals))
             models = learnt_parts(model, signals, choice)
             params = replace(params, observed=signals.pv[choice.observed].name)
         elif params.horizon is not None:

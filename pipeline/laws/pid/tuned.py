@@ -28,7 +28,7 @@ HOLDS = (60, 400)  # least and most
 
 
 @dataclass(frozen=True, slots=True)
-class Tuned:
+class TunedLoops:
     """Settings of one loop, or of the loop of each pair; of several loops also the pairings that were tuned.
 
     The first of ``pairings`` is that of ``pairs``.
@@ -54,20 +54,22 @@ class HoldsLinearization(Protocol):
         """The linearization, per second."""
 
 
-def tuned(params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None, law_of: LawOf) -> Tuned:
+def tuned(
+    params: Any, models: Mapping[str, Model], signals: Signals, plant: Simulator | None, law_of: LawOf
+) -> TunedLoops:
     """The numbers that ``params`` of the PID ask for; raises LawError where their tuning does not apply."""
     p, (given, *_) = params, params.given()
     pairs = given_pairs(p, signals)
     if p.tuning == "manual" and pairs is not None:
         require_numbers(p)
         of = dict(zip(p.pairs, p.given(), strict=True))
-        return Tuned(tuple(of[signals.mv[j].name] for _, j in pairs), pairs)
+        return TunedLoops(tuple(of[signals.mv[j].name] for _, j in pairs), pairs)
     if plant is not None and by_simulation(p, plant):
         return _searched(p, signals, plant, law_of)
     require_single_loop(signals, "pid")
     if p.tuning == "manual":
         require_numbers(p)
-        return Tuned(given)
+        return TunedLoops(given)
     lin, dead_s = linearization(params, models, plant)
     if p.tuning == "itae":
         settings = rules.itae_pid(LagWithDeadTime.of(lin, dead_time_s=dead_s), signals.period_s, p.sampling)
@@ -89,11 +91,11 @@ def tuned(params: Any, models: Mapping[str, Model], signals: Signals, plant: Sim
             return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
 
         settings = rules.optimized_imc(AllPole.near(lin), signals.period_s, cost, given, optimize_weight=free)
-        return Tuned(settings)
+        return TunedLoops(settings)
     else:
         raise LawError(f"PID tuning is {p.tuning!r}; allowed are optimized, imc, simc, itae, manual")
     rest = {name: getattr(given, name) for name in ("filter_s", "tracking_s", "set_point_weight")}
-    return Tuned(replace(settings, **rest))
+    return TunedLoops(replace(settings, **rest))
 
 
 def given_pairs(params: Any, signals: Signals) -> Pairs | None:
@@ -120,7 +122,7 @@ def require_numbers(params: Any) -> None:
         raise LawError("PID tuning `manual` needs kc and ti_s; give both or take optimized, imc, simc or itae")
 
 
-def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) -> Tuned:
+def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) -> TunedLoops:
     """The cheapest numbers in closed loop over the plant and its variations, of the given or the best two pairings."""
     responses = StepResponses.near_start(plant)
     low, high = plant.asked
@@ -147,7 +149,7 @@ def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) ->
     # The first of equal ones: sorting keeps their order.
     found.sort(key=lambda row: row[0])
     _, settings, best = found[0]
-    return Tuned(settings, best.pairs, tuple(row[2] for row in found) if len(best.pairs) > 1 else ())
+    return TunedLoops(settings, best.pairs, tuple(row[2] for row in found) if len(best.pairs) > 1 else ())
 
 
 def by_simulation(params: Any, plant: Simulator) -> bool:

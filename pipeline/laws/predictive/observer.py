@@ -46,7 +46,7 @@ def load_variance(model: Identified) -> Tensor:
     return LOAD_CHANGE / torch.clamp(model.noise, min=NOISE_FLOOR)
 
 
-class Estimate(NamedTuple):
+class StateEstimate(NamedTuple):
     """The state and the loads, their covariance, and the mean innovation."""
 
     mean: Tensor  # (..., 1, n_x + n_d) [x, d]
@@ -143,7 +143,7 @@ class Observer(nn.Module):
             swings=SWINGS,
         )
 
-    def forward(self, y: Tensor, v: Tensor, past: Estimate) -> tuple[Estimate, Tensor]:
+    def forward(self, y: Tensor, v: Tensor, past: StateEstimate) -> tuple[StateEstimate, Tensor]:
         """The estimate after the measurement, and the boost b (..., 1, n_y), 0 to 1.
 
         y (..., 1, n_y) and v (..., 1, n_v) scaled: what is measured now, and what acted over the last period.
@@ -164,13 +164,13 @@ class Observer(nn.Module):
             gain = row / (row[..., o : o + 1] + self.r[o : o + 1])
             mean = mean + gain * (y[..., o : o + 1] - mean[..., o : o + 1])
             covariance = covariance - gain.reshape(*gain.shape[:-2], self.n_a, 1) * row
-        return Estimate(mean, covariance, drift, squares), self.fall * boost
+        return StateEstimate(mean, covariance, drift, squares), self.fall * boost
 
     def ahead(self, mean: Tensor, v: Tensor) -> Tensor:
         """[x, d] (..., 1, n_a) one period on under v."""
         return self._advanced(mean, v)[0]
 
-    def predicted(self, v: Tensor, past: Estimate) -> tuple[Tensor, Tensor]:
+    def predicted(self, v: Tensor, past: StateEstimate) -> tuple[Tensor, Tensor]:
         """Mean and covariance one period on, before the measurement."""
         mean, t = self._advanced(past.mean, v)
         if t is None:

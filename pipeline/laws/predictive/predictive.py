@@ -13,7 +13,7 @@ from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require
 from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, held_rest, loads_of
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
 from loopwright.pipeline.laws.predictive.horizon_check import Sight, horizon_for, mvs_of, refuse_unstable
-from loopwright.pipeline.laws.predictive.observer import Estimate, Noises, Observer, load_variance
+from loopwright.pipeline.laws.predictive.observer import Noises, Observer, StateEstimate, load_variance
 from loopwright.pipeline.laws.predictive.params import (
     PredictiveParams,
     check_sizes,
@@ -22,9 +22,9 @@ from loopwright.pipeline.laws.predictive.params import (
     weights_of,
 )
 from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
-from loopwright.pipeline.laws.predictive.set_points import PRICE, SetPoints, SoftLimits
-from loopwright.pipeline.laws.predictive.tuning import Candidate, calmest, in_words, tuned
-from loopwright.pipeline.laws.predictive.tuning_loops import Trials
+from loopwright.pipeline.laws.predictive.set_points import PRICE, SetPointCourse, SoftLimits
+from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, calmest, in_words, tuned
+from loopwright.pipeline.laws.predictive.tuning_loops import TuningLoops
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.memory import AffineMap, Named
@@ -47,7 +47,8 @@ class Predictive(ControlLaw):
     variables and the applied MV, under the loads that hold it there: on set point it asks for that MV. The set points r
     stay as they are, or go on with their last slope. CVs may have soft limits, whose cost is added.
 
-    ``Observer``, ``Horizon``, ``Planner``, ``SetPoints`` and ``SoftLimits`` hold the formulas and their sources.
+    ``Observer``, ``LinearHorizon`` and ``NetworkHorizon``, ``Planner``, ``SetPointCourse`` and ``SoftLimits`` hold the
+    formulas and their sources.
     """
 
     name: ClassVar[str] = "predictive"
@@ -57,7 +58,7 @@ class Predictive(ControlLaw):
     parts: ClassVar[Mapping[str, str]] = {"identified": "kind identified"}
     Params: ClassVar[type[Any]] = PredictiveParams
 
-    tried: tuple[Candidate, ...] = ()  # of a search, the numbers that it started from first
+    tried: tuple[TriedNumbers, ...] = ()  # of a search, the numbers that it started from first
     remarks: tuple[str, ...] = ()  # on a horizon that is short for the model
     shift: Tensor  # (m, m) of a plan to the next sample
     upper: Tensor  # where the flat covariance's upper half stands
@@ -112,7 +113,7 @@ class Predictive(ControlLaw):
         low, high = ((torch.from_numpy(end) - model.y_center[:n_cv]) / model.y_scale[:n_cv] for end in found)
         return low, high
 
-    def _set_points(self, model: Identified, bounds: tuple[Tensor, Tensor] | None, *, ramp: bool) -> SetPoints:
+    def _set_points(self, model: Identified, bounds: tuple[Tensor, Tensor] | None, *, ramp: bool) -> SetPointCourse:
         """The course of the set points over the horizon, within ``bounds``; a ramp ends at the signals' ranges."""
         n_cv = len(self.signals.sp)
         if ramp:
@@ -121,7 +122,7 @@ class Predictive(ControlLaw):
             if bounds is not None:
                 low, high = (torch.minimum(torch.maximum(end, bounds[0]), bounds[1]) for end in (low, high))
             bounds = low, high
-        return SetPoints(self.moves.horizon, n_cv, bounds, ramp=ramp)
+        return SetPointCourse(self.moves.horizon, n_cv, bounds, ramp=ramp)
 
     @torch.no_grad()
     def _build_ends(self, model: Identified, loads: Loads, n_cv: int, middle: Tensor, half: Tensor) -> None:
@@ -205,7 +206,7 @@ class Predictive(ControlLaw):
             return type(self)(self.signals, model, changed).eval()
 
         start = {n: float(getattr(params, n)) for n in ("speed", "caution", "jumps")} | {"horizon": float(horizon)}
-        found = tuned(Trials.draw(model, self.signals, horizon, params.seed), law_of, start, params.damping)
+        found = tuned(TuningLoops.draw(model, self.signals, horizon, params.seed), law_of, start, params.damping)
         law: Self = law_of(found.numbers, found.damping, params)
         law.tried = found.tried
         return law
@@ -277,7 +278,9 @@ class Predictive(ControlLaw):
         packed = kept["covariance"]
         square = packed.index_select(-1, self.whole).reshape(*packed.shape[:-2], n_a, n_a)
         acted = torch.cat([now["v"][..., :n_mv], *(kept[n] for n in ("dv",) if n in kept)], dim=-1)
-        seen, boost = self.observer(now["y"], acted, Estimate(kept["mean"], square, kept["drift"], kept["squares"]))
+        seen, boost = self.observer(
+            now["y"], acted, StateEstimate(kept["mean"], square, kept["drift"], kept["squares"])
+        )
         flat = seen.covariance.flatten(-2).index_select(-1, self.upper).unsqueeze(-2)
         known = torch.cat([seen.mean, flat, seen.drift, seen.squares, kept["plan"] @ self.shift], dim=-1)
         first = torch.cat([self._first(now), now["past"]], dim=-1)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from loopwright.pipeline.laws.base import hold_numbers
 
 
-class SetPoints(nn.Module):
+class SetPointCourse(nn.Module):
     """Set points r(k+1) .. r(k+N) from those of now and, with ``ramp``, of the two samples before.
 
         held:  r(k+i) = r(k)

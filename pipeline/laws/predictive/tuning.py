@@ -11,7 +11,7 @@ import numpy as np
 from loopwright.pipeline.engine.progress import steps
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
-from loopwright.pipeline.laws.predictive.tuning_loops import Outcome, side_by_side
+from loopwright.pipeline.laws.predictive.tuning_loops import LoopErrors, side_by_side
 
 TRAVEL = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
 NEAR = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it
@@ -28,7 +28,7 @@ Numbers = dict[str, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class TriedNumbers:
     """Numbers that were tried, their cost J, and what it is made of: errors over the first ones', and travel."""
 
     numbers: Numbers
@@ -50,14 +50,14 @@ class Candidate:
 class Tries(Protocol):
     """Loops of laws side by side: ``Trials``."""
 
-    def run(self, laws: ControlLaw, count: int) -> Outcome:
+    def run(self, laws: ControlLaw, count: int) -> LoopErrors:
         """The loops of ``count`` laws."""
 
     def growth(self, law: ControlLaw) -> float:
         """How far a small difference grows in the loops of one law."""
 
 
-def judged(outcome: Outcome, given: Outcome, numbers: Sequence[Numbers]) -> list[Candidate]:
+def judged(outcome: LoopErrors, given: LoopErrors, numbers: Sequence[Numbers]) -> list[TriedNumbers]:
     """Each law with its ``numbers`` beside the ``given`` one's first, whose errors count 1.
 
         J = (E_sp/E_sp0 + E_load/E_load0)/2 + .05 (T_sp + T_load)/2
@@ -68,10 +68,10 @@ def judged(outcome: Outcome, given: Outcome, numbers: Sequence[Numbers]) -> list
     sp, loads = (getattr(outcome, n).mean(axis=-1) / getattr(given, n).mean() for n in ("set_points", "loads"))
     travel = outcome.travel.mean(axis=-1)
     rows = zip(numbers, 0.5 * (sp + loads) + TRAVEL * travel, sp, loads, travel, strict=True)
-    return [Candidate(dict(n), *map(float, figures)) for n, *figures in rows]
+    return [TriedNumbers(dict(n), *map(float, figures)) for n, *figures in rows]
 
 
-def calmest(tried: Sequence[Candidate]) -> Candidate:
+def calmest(tried: Sequence[TriedNumbers]) -> TriedNumbers:
     """The numbers of the least travel among those whose error is at most ``CALM`` more than the least.
 
     The travel is not in the limit: counted there too, it cost several times these 5 % on plants whose loads wander.
@@ -82,7 +82,7 @@ def calmest(tried: Sequence[Candidate]) -> Candidate:
 
 def searched(
     trials: Tries, law_of: Callable[[Mapping[str, float]], ControlLaw], start: Numbers
-) -> tuple[Candidate, list[Candidate]]:
+) -> tuple[TriedNumbers, list[TriedNumbers]]:
     """The calmest of the best numbers by a search from ``start``, and all that were tried, the start first.
 
     Speed and caution together on a coarse grid, then the horizon, then the jumps, then a finer grid. Numbers far from
@@ -123,12 +123,12 @@ def searched(
 
 
 @dataclass(frozen=True, slots=True)
-class Tuned:
+class TunedLaw:
     """Result of a search: the best numbers, the damping of the passes (None: no reason for any), all that it tried."""
 
     numbers: Numbers
     damping: float | None
-    tried: tuple[Candidate, ...]
+    tried: tuple[TriedNumbers, ...]
 
 
 def tuned(
@@ -136,7 +136,7 @@ def tuned(
     law_of: Callable[[Mapping[str, float], float | None], ControlLaw],
     start: Numbers,
     damping: float | None = None,
-) -> Tuned:
+) -> TunedLaw:
     """The best numbers of the laws ``law_of(numbers, damping)``; without a ``damping`` the least that the loops stand.
 
     The damping is the least with which a small difference does not grow in the loops. Where it grows with each, the
@@ -150,10 +150,10 @@ def tuned(
     first = stood(start, 0.0) if damping is None else damping
     best, tried = searched(trials, lambda numbers: law_of(numbers, first), start)
     last = stood(best.numbers, first) if damping is None and first is not None else first
-    return Tuned(best.numbers, last, tuple(tried))
+    return TunedLaw(best.numbers, last, tuple(tried))
 
 
-def in_words(tried: Sequence[Candidate]) -> str:
+def in_words(tried: Sequence[TriedNumbers]) -> str:
     """The numbers that a search tried, its start first, and its gain, for the report."""
     first, least, taken = tried[0].cost, min(c.cost for c in tried), calmest(tried).cost
     costs = f"{first:.3g} with the first numbers, {least:.3g} at the least and {taken:.3g} with those taken"

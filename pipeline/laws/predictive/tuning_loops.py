@@ -67,7 +67,7 @@ AT_OUTPUT = (3, 4, 5)  # loops whose loads act on the outputs; those of the othe
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class LoopErrors:
     """The errors of the loops of C laws [% of four standard deviations], and the MVs' travel [% of range a sample]."""
 
     set_points: Array  # (C, LOOPS)
@@ -76,7 +76,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class Trials:
+class TuningLoops:
     """Loops side by side over plants that are the model with errors: of gain, of dead time, of pace.
 
         F(x) = f(x, m + g (u - m) + bias),      x+ = x + p (F(x) - x) + [load; 0]
@@ -143,7 +143,7 @@ class Trials:
         return cls(model, signals, horizon, x0, *drawn)
 
     @torch.no_grad()
-    def run(self, laws: ControlLaw, count: int) -> Outcome:
+    def run(self, laws: ControlLaw, count: int) -> LoopErrors:
         """The loops of ``count`` laws side by side; infinite where a loop is not finite."""
         n_cv, span = self.sp.shape[-1], self._span
         error = torch.zeros(count, self.sp.shape[1], dtype=torch.float64)
@@ -155,7 +155,7 @@ class Trials:
         error, travel = (100 / (len(self.sp) - self.quiet) * t for t in (error / SPAN, travel))
         error = torch.nan_to_num(error, nan=torch.inf)
         moved = torch.stack([travel[:, :LOOPS].mean(dim=-1), travel[:, LOOPS:].mean(dim=-1)], dim=-1)
-        return Outcome(error[:, :LOOPS].numpy(), error[:, LOOPS:].numpy(), moved.numpy())
+        return LoopErrors(error[:, :LOOPS].numpy(), error[:, LOOPS:].numpy(), moved.numpy())
 
     @torch.no_grad()
     def growth(self, law: ControlLaw) -> float:

@@ -25,7 +25,7 @@ P = TypeVar("P", bound=Trainable)
 DAMPINGS = 8  # tries an iteration
 
 
-class Sums(NamedTuple):
+class LoopSums(NamedTuple):
     """Mean squared residual of the loops, and J'J (P, P) and J'r (P,) for a step of Gauss and Newton."""
 
     cost: float
@@ -54,7 +54,7 @@ def follow(
     loops: Loops,
     move_weight: float,
     derivatives: bool = True,
-) -> Sums:
+) -> LoopSums:
     r"""Run the loops with forward sensitivities, dx/dtheta beside x.
 
         X(k+1) = f_x X(k) + f_u U(k),   U(k) = du/dtheta + u_y C X(k) + u_u U(k-1) + u_e E(k-1),   E = -C X
@@ -104,7 +104,7 @@ def follow(
             sx += jac[:, plant.n_x][:, :, None] * su[:, None, :]
         course = course @ phi.T + loops.sp[k][:, None] * gamma[:, 0]
     count = n * lanes
-    return Sums((tracking + moves) / count, tracking / count, square, slope)
+    return LoopSums((tracking + moves) / count, tracking / count, square, slope)
 
 
 def trained_policy(
@@ -149,7 +149,7 @@ def _descend(
     start, cv = theta, policy.signals.sp[0]
     pull = (options.decay * (cv.high - cv.low)) ** 2
 
-    def sums(at: Array, which: int) -> Sums:
+    def sums(at: Array, which: int) -> LoopSums:
         of_loops = follow(policy, at, plant, reference, held[which], options.move_weight, derivatives=which == 0)
         if which:
             return of_loops

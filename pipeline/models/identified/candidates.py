@@ -27,7 +27,7 @@ from loopwright.pipeline.models.identified.linear_start import (
 )
 from loopwright.pipeline.models.identified.output_error import (
     Fitted,
-    OutputError,
+    OutputErrorFit,
     fit_starts,
     residuals,
 )
@@ -58,28 +58,28 @@ HELD, RESTS = 60, 0.9
 
 # ---------------------------------------------------------------------- starts
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class FoldStart:
     """Where the balanced candidates of a fold start from, and the dead times that its impulse response shows."""
 
     realizations: Realizations
     dead_times: tuple[int, ...]
 
 
-def find_start(problem: Problem, task: tuple[Structure, int]) -> Start | str:
+def find_start(problem: Problem, task: tuple[Structure, int]) -> FoldStart | str:
     """The start of a fold's balanced candidates under a structure's shifts; the reason where there is none."""
     structure, fold = task
     try:
         train = problem.part(structure, problem.folds[fold].train)
         response = problem.known.without(high_order_arx(train).impulse_response(RESPONSE))
         weight = problem.known.weights(train.v.std(axis=0))
-        return Start(Realizations.of(response, weight), tuple(dead_times(response, weight)))
+        return FoldStart(Realizations.of(response, weight), tuple(dead_times(response, weight)))
     except ModelError as error:
         return str(error)
 
 
 # ---------------------------------------------------------------------- fits
 @dataclass(frozen=True, slots=True, eq=False)
-class Task:
+class FitTask:
     """A fit of a structure on a fold: ``iterations`` more from ``begun``.
 
     Without ``begun`` a balanced candidate starts from ``start``, a lagged one from its least squares; a network from
@@ -90,12 +90,12 @@ class Task:
     fold: int
     iterations: int
     seed: int = 0
-    start: Start | None = None
+    start: FoldStart | None = None
     base: Fitted | None = None
     begun: Fitted | None = None
 
 
-def fit(problem: Problem, task: Task) -> Fitted | str:
+def fit(problem: Problem, task: FitTask) -> Fitted | str:
     """The fitted candidate; the reason where the data cannot carry it.
 
     A network that explodes or swings under constant inputs, where the plant settles, counts as exploded.
@@ -119,7 +119,7 @@ def _beside_what_is_known(problem: Problem, fitted: Fitted) -> Fitted:
     return replace(fitted, model=model, against=problem.known.against(model.plant, problem.data))
 
 
-def _linear(problem: Problem, task: Task) -> Fitted:
+def _linear(problem: Problem, task: FitTask) -> Fitted:
     s = task.structure
     train, held = problem.train(s, task.fold), problem.held(s, task.fold)
     if task.begun is not None:
@@ -130,9 +130,9 @@ def _linear(problem: Problem, task: Task) -> Fitted:
         if task.start is None:
             raise ModelError("the record shows no impulse response to start from")
         model = task.start.realizations.order(s.order)
-        first = OutputError(iterations=3, correction=s.correction).fit(model, train, free=model.mask(b=True, c=True))
+        first = OutputErrorFit(iterations=3, correction=s.correction).fit(model, train, free=model.mask(b=True, c=True))
         model, starts = first.model, first.starts
-    fitter = OutputError(iterations=task.iterations, correction=s.correction, judged=problem.judged)
+    fitter = OutputErrorFit(iterations=task.iterations, correction=s.correction, judged=problem.judged)
     return fitter.fit(model, train, held, starts=starts)
 
 
@@ -141,7 +141,7 @@ def _lagged(problem: Problem, structure: Structure, fold: int) -> Dynamics:
     return problem.known.lagged(lagged_start(rows, *structure.lags), structure.lags[0])
 
 
-def _network(problem: Problem, task: Task) -> Fitted:
+def _network(problem: Problem, task: FitTask) -> Fitted:
     """A network, begun as its linear model with units that do nothing.
 
     A lagged start first trains one step ahead (correction 1, output rows only), then frees all rows. The free run of
@@ -149,7 +149,7 @@ def _network(problem: Problem, task: Task) -> Fitted:
     """
     s = task.structure
     train, held = problem.train(s, task.fold), problem.held(s, task.fold)
-    fitter = OutputError(
+    fitter = OutputErrorFit(
         iterations=task.iterations, correction=s.correction, judged=problem.judged, ridge=s.ridge, patience=PATIENCE
     )
     if task.begun is not None:
@@ -166,11 +166,11 @@ def _network(problem: Problem, task: Task) -> Fitted:
     model = with_units(linear, states, inputs, s.n_hidden, 1000 * problem.seed + task.seed)
     work = 0
     if starts is None:
-        one_step = OutputError(iterations=BEGIN, correction=1.0, ridge=s.ridge)
+        one_step = OutputErrorFit(iterations=BEGIN, correction=1.0, ridge=s.ridge)
         first = one_step.fit(model, train, free=output_rows(model, problem.data.y.shape[1]))
         model, work = first.model, first.work
-    eased = OutputError(iterations=BEGIN, correction=max(EASED, s.correction), ridge=s.ridge)
-    plain = OutputError(iterations=BEGIN, correction=s.correction, ridge=s.ridge)
+    eased = OutputErrorFit(iterations=BEGIN, correction=max(EASED, s.correction), ridge=s.ridge)
+    plain = OutputErrorFit(iterations=BEGIN, correction=s.correction, ridge=s.ridge)
     by_way, at_once = eased.fit(model, train, starts=starts), plain.fit(model, train, starts=starts)
     after = plain.fit(by_way.model, train, starts=by_way.starts)
     begun = min((after, at_once), key=lambda fitted: fitted.trained)
@@ -178,7 +178,7 @@ def _network(problem: Problem, task: Task) -> Fitted:
     return replace(found, work=work + by_way.work + at_once.work + after.work + found.work)
 
 
-def _with_noise(problem: Problem, task: Task) -> Fitted:
+def _with_noise(problem: Problem, task: FitTask) -> Fitted:
     """A linear model with its noise: the impulse response of the ARX as it is, its filter fitted; or all refined.
 
     One-step errors say little of what a plant does slowly, and the prior of the ARX says it better than a fit that is
@@ -196,7 +196,7 @@ def _with_noise(problem: Problem, task: Task) -> Fitted:
     return PredictionError(iterations=task.iterations).fit(model, train, held, gain_alone=s.noise == "gain")
 
 
-def _bent(problem: Problem, task: Task) -> Fitted:
+def _bent(problem: Problem, task: FitTask) -> Fitted:
     """A network with its noise, begun as its linear model with units that do nothing."""
     s = task.structure
     train, held = problem.train(s, task.fold), problem.held(s, task.fold)
@@ -236,7 +236,7 @@ def _on_all_rows(problem: Problem, structure: Structure, fitted: Fitted) -> Fitt
     if isinstance(fitted.model, Innovations):
         return _with_noise_on_all_rows(problem, structure, fitted, fitted.model)
     for iterations in (30, 8, 2):
-        fitter = OutputError(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
+        fitter = OutputErrorFit(iterations=iterations, correction=structure.correction, ridge=structure.ridge)
         found = fitter.fit(fitted.model, whole)
         if not problem.settles or _settles_too(problem, found.model, fitted.model):
             return found
@@ -291,7 +291,7 @@ def within_limits(problem: Problem, structure: Structure, fitted: Fitted) -> Fit
         except ModelError:  # no filter follows: laws say what they think of such a plant
             return replace(fitted, model=inner)
     inside = replace(model, a=within_unit_circle(model.a, 1 - 1e-9))
-    again = OutputError(iterations=5, correction=structure.correction)
+    again = OutputErrorFit(iterations=5, correction=structure.correction)
     return again.fit(inside, problem.whole(structure), free=inside.mask(b=True, c=True))
 
 

@@ -146,7 +146,7 @@ def noise_of(residuals: Sequence[Array]) -> Array:
     return np.asarray(np.minimum(differenced, np.concatenate(list(residuals)).std(axis=0)))
 
 
-def assembled(
+def assemble_model(
     model: Dynamics,
     delays: Sequence[int],
     scales: Scales,

@@ -12,11 +12,11 @@ from loopwright.pipeline.config.known import NONE
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.candidates import on_all_rows, within_limits
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
-from loopwright.pipeline.models.identified.identified import Identified, assembled, noise_of
+from loopwright.pipeline.models.identified.identified import Identified, assemble_model, noise_of
 from loopwright.pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
 from loopwright.pipeline.models.identified.knowledge import known_figures
 from loopwright.pipeline.models.identified.model_validation import (
-    Answer,
+    ProvenAnswer,
     answers,
     foreseen,
     proof_figures,
@@ -160,7 +160,7 @@ class IdentifiedPart(Part):
         disturbances = {"dv_noise": measured.noise, "dv_change": measured.change}
         loads = {"load_moves": _load_moves(fitted.model, whole)}
         known = {"noise": noise, "colour": colour, **loads, **disturbances, **open_to}
-        model = assembled(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
+        model = assemble_model(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
         for name, phi in zip(runs, colour, strict=True):
@@ -207,7 +207,11 @@ class IdentifiedPart(Part):
 
 
 def _proof(
-    searched: Searched, record: Record, found: tuple[dict[tuple[int, int], Answer], Array], runs: Figures, noise: Array
+    searched: Searched,
+    record: Record,
+    found: tuple[dict[tuple[int, int], ProvenAnswer], Array],
+    runs: Figures,
+    noise: Array,
 ) -> dict[str, Any]:
     """Whether the record proves the model; ``found`` of ``answers``, ``runs`` over the first fold's held-out rows.
 

@@ -18,7 +18,7 @@ from scipy import linalg
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
-from loopwright.pipeline.models.identified.output_error import Fitted, OutputError, fit_starts, residuals
+from loopwright.pipeline.models.identified.output_error import Fitted, OutputErrorFit, fit_starts, residuals
 from loopwright.pipeline.plants.simulator import Array
 
 LOADS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
@@ -271,7 +271,7 @@ class PredictionError:
             return whole * typical(innovations(trial, late)) if late else np.inf
 
         free = near.mask(gain=True) if gain_alone else near.free()
-        fitter = OutputError(iterations=self.iterations, ridge=self.ridge, patience=self.patience)
+        fitter = OutputErrorFit(iterations=self.iterations, ridge=self.ridge, patience=self.patience)
         found = fitter.fit(near, train, late, free=free, judge=judge)
         if not isinstance(found.model, Innovations):  # the type of what went in
             raise TypeError(type(found.model).__name__)

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.models.identified.candidates import Start, Task
+from loopwright.pipeline.models.identified.candidates import FitTask, FoldStart
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.linear_start import within_unit_circle
 from loopwright.pipeline.models.identified.network_search import Rounds
-from loopwright.pipeline.models.identified.structure import Structure, Trial
+from loopwright.pipeline.models.identified.structure import CandidateFits, Structure
 
 MOST_STATES = 18
 """States of a lagged start beyond which it is not tried."""
@@ -38,7 +38,7 @@ class LinearSearch:
     """The search among linear models of one problem."""
 
     rounds: Rounds
-    starts: dict[tuple[Structure, int], Start | str]
+    starts: dict[tuple[Structure, int], FoldStart | str]
 
     @classmethod
     def of(cls, rounds: Rounds) -> LinearSearch:
@@ -50,13 +50,13 @@ class LinearSearch:
         none = Structure("balanced", 0, (0, 0), known.delays((0,) * rounds.problem.data.v.shape[1]))
         starts = rounds.starts([none])
         first = starts[none, 0]
-        if isinstance(first, Start) and max(first.dead_times) > 0:
+        if isinstance(first, FoldStart) and max(first.dead_times) > 0:
             # The dead times that are seen lie beyond the delays that the response was taken with.
             seen = known.delays([d + more for d, more in zip(none.delays, first.dead_times, strict=True)])
             starts |= rounds.starts([replace(none, delays=seen)])
         return cls(rounds, starts)
 
-    def first_round(self, orders: Sequence[int], correction: float, lagged: bool = True) -> list[Trial]:
+    def first_round(self, orders: Sequence[int], correction: float, lagged: bool = True) -> list[CandidateFits]:
         """The candidates after a short training on the first fold, best first; ModelError where none can be fitted.
 
         Without ``lagged`` the balanced ones alone.
@@ -69,7 +69,7 @@ class LinearSearch:
             if order <= MOST_STATES:
                 structures.extend(Structure("lagged", order, (y_lags, v_lags), d) for d in options)
         offered = [replace(s, correction=correction) for s in self.rounds.affordable(structures, SHORT, 0.3)]
-        tasks = [Task(s, 0, SHORT, start=self.start(s, 0)) for s in offered]
+        tasks = [FitTask(s, 0, SHORT, start=self.start(s, 0)) for s in offered]
         trials, reasons = self.rounds.trials(tasks, "linear models, first fits")
         finite = [t for t in trials if np.isfinite(t.error)]
         if not finite:
@@ -80,7 +80,7 @@ class LinearSearch:
             finite, key=lambda t: (t.against, t.error, 0) if t.error > limit else (t.against, 0.0, t.structure.order)
         )
 
-    def finish(self, shortlist: Sequence[Trial]) -> list[Trial]:
+    def finish(self, shortlist: Sequence[CandidateFits]) -> list[CandidateFits]:
         """The best of a short list and its smallest models, both starts among them, trained to the end on all folds.
 
         The smallest balanced ones are there for networks: units do with few states what a linear model does with many.
@@ -91,14 +91,14 @@ class LinearSearch:
         kept.extend(t for t in (*balanced[:2], *lagged[:2], *small) if t not in kept)
         folds = range(len(self.rounds.problem.folds))
         tasks = [
-            Task(t.structure, k, LONG, start=self.start(t.structure, k), begun=t.fits.get((k, 0)))
+            FitTask(t.structure, k, LONG, start=self.start(t.structure, k), begun=t.fits.get((k, 0)))
             for t in kept
             for k in folds
         ]
         finished = self.rounds.trials(tasks, "the best linear models, fitted to the end")[0] or kept
         return smallest_first(finished)
 
-    def in_the_same_row(self, trials: Sequence[Trial]) -> list[Trial]:
+    def in_the_same_row(self, trials: Sequence[CandidateFits]) -> list[CandidateFits]:
         """The best balanced and the best lagged candidate again, the MVs acting in their own row."""
         kept = [next((t for t in trials if t.structure.start == start), None) for start in ("balanced", "lagged")]
         structures = [replace(t.structure, same_row=True) for t in kept if t is not None]
@@ -106,30 +106,30 @@ class LinearSearch:
             self.rounds.starts([replace(s, order=0, correction=0.0) for s in structures if s.start == "balanced"])
         )
         tasks = [
-            Task(s, k, SHORT + LONG, start=self.start(s, k))
+            FitTask(s, k, SHORT + LONG, start=self.start(s, k))
             for s in structures
             for k in range(len(self.rounds.problem.folds))
         ]
         return smallest_first(self.rounds.trials(tasks, "linear models whose MV acts in its own row of the record")[0])
 
-    def settling(self, trials: Sequence[Trial]) -> list[Trial]:
+    def settling(self, trials: Sequence[CandidateFits]) -> list[CandidateFits]:
         """The best candidates again, begun with all poles within ``SETTLING``.
 
         A nonlinear plant can leave the impulse response, and the fit that starts from it, with a pole at 1 that the
         plant does not have; an integrator's pole finds its way back.
         """
         tasks = [
-            Task(t.structure, k, LONG, begun=replace(f, model=inside(f.model)))
+            FitTask(t.structure, k, LONG, begun=replace(f, model=inside(f.model)))
             for t in trials[:2]
             for (k, _), f in t.fits.items()
         ]
         return smallest_first(self.rounds.trials(tasks, "linear models again, begun without integrator")[0])
 
-    def corrected(self, trials: Sequence[Trial], correction: float) -> list[Trial]:
+    def corrected(self, trials: Sequence[CandidateFits], correction: float) -> list[CandidateFits]:
         """The same candidates, trained with another correction of their runs."""
         folds = range(len(self.rounds.problem.folds))
         tasks = [
-            Task(replace(t.structure, correction=correction), k, SHORT + LONG, start=self.start(t.structure, k))
+            FitTask(replace(t.structure, correction=correction), k, SHORT + LONG, start=self.start(t.structure, k))
             for t in trials
             for k in folds
         ]
@@ -137,14 +137,14 @@ class LinearSearch:
             self.rounds.trials(tasks, "linear models again, with a slow correction of their error")[0]
         )
 
-    def start(self, structure: Structure, fold: int) -> Start | None:
+    def start(self, structure: Structure, fold: int) -> FoldStart | None:
         """Where the balanced candidates of a fold start from; None without an impulse response."""
         shift = (structure.delays, structure.same_row, fold)
         found = (start for (s, k), start in self.starts.items() if (s.delays, s.same_row, k) == shift)
-        return next((start for start in found if isinstance(start, Start)), None)
+        return next((start for start in found if isinstance(start, FoldStart)), None)
 
 
-def _by_order(trials: Sequence[Trial]) -> list[list[Trial]]:
+def _by_order(trials: Sequence[CandidateFits]) -> list[list[CandidateFits]]:
     """The trials of each order, the smallest order first."""
     orders = sorted({t.structure.order for t in trials})
     return [[t for t in trials if t.structure.order == n] for n in orders]
@@ -155,7 +155,7 @@ def inside(model: Dynamics) -> Dynamics:
     return replace(model, a=within_unit_circle(model.a, SETTLING))
 
 
-def smallest_first(trials: Sequence[Trial]) -> list[Trial]:
+def smallest_first(trials: Sequence[CandidateFits]) -> list[CandidateFits]:
     """Best first, those of fewer folds last; of those within 1 % of the best the smallest leads.
 
     A state less is one less to mislead. Those that contradict what is known of the plant come after all others.

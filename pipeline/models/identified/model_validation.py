@@ -21,7 +21,15 @@ from loopwright.pipeline.historian.feedback import follows
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_start import high_order_arx
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
-from loopwright.pipeline.models.identified.structure import SMALL, Cells, Problem, Structure, Trial, alike, pieces
+from loopwright.pipeline.models.identified.structure import (
+    SMALL,
+    CandidateFits,
+    Cells,
+    Problem,
+    Structure,
+    alike,
+    pieces,
+)
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 
@@ -38,7 +46,7 @@ LEFT_OUT = 0.05  # of the models' weight, at either end of their answers: one po
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ProvenAnswer:
     """How a PV answers to an MV, in PV/MV: the mean over the rows ``first`` to ``last`` after a step.
 
     ``model`` is the fitted model's, ``low`` and ``high`` the ends over the models as likely as it; ``direct`` with the
@@ -96,7 +104,7 @@ class Answer:
         near = abs(self.model - self.direct) <= SURE * self.sd
         return PROVEN if near or 1 / TIMES <= self.model / self.direct <= TIMES else SIZE
 
-    def times(self, unit: float, scale: float = 1.0, center: float = 0.0) -> Answer:
+    def times(self, unit: float, scale: float = 1.0, center: float = 0.0) -> ProvenAnswer:
         """The same in another unit; values of the MV times ``scale`` plus ``center``."""
         model, low, high = (value * unit for value in (self.model, self.low, self.high))
         direct, sd = (None if value is None else value * unit for value in (self.direct, self.sd))
@@ -122,7 +130,7 @@ class Region:
     start: float
     end: float
     small: bool
-    answer: Answer
+    answer: ProvenAnswer
 
 
 def answers(
@@ -133,7 +141,7 @@ def answers(
     n_mv: int,
     cells: Cells | None = None,
     weights: Array | None = None,
-) -> tuple[dict[tuple[int, int], Answer], Array]:
+) -> tuple[dict[tuple[int, int], ProvenAnswer], Array]:
     """((output, MV) -> answer, scaled, of the answers that a controller uses; error of one-step predictions (n_y,)).
 
     ``curves`` (members, n_v, length, n_y) are the answers of the models to steps of ``size`` (n_v,) scaled; the first
@@ -150,7 +158,7 @@ def answers(
         reach = np.maximum(reach, [np.abs(of).max(axis=(0, 1)) for of in ways])
     halves = np.array_split(np.arange(len(fitted)), 2)
     parts = [fitted, *(fitted.rows(slice(int(of[0]), int(of[-1]) + 1)) for of in halves)]
-    found: dict[tuple[int, int], Answer] = {}
+    found: dict[tuple[int, int], ProvenAnswer] = {}
     surprise = np.full(curves.shape[3], np.inf)
     for i in range(curves.shape[3]):
         used = [j for j in range(n_mv) if reach[j, i] >= USED * reach[:, i].max()]
@@ -242,16 +250,18 @@ def _place(curve: Array, late: int) -> tuple[slice, int, int]:
 
 def _answer(
     of_models: Array, weights: Array, direct: Sequence[DirectModel | None], j: int, first: int, last: int
-) -> Answer:
+) -> ProvenAnswer:
     low, model, high = map(float, _weighed(of_models, weights))
     whole, *halves = (None if model is None else model.answer(j, first, last) for model in direct)
     if whole is None:
-        return Answer(model, low, high, first, last)
+        return ProvenAnswer(model, low, high, first, last)
     known = tuple(value / sd for value, sd in (half for half in halves if half is not None))
-    return Answer(model, low, high, first, last, whole[0], whole[1], known)
+    return ProvenAnswer(model, low, high, first, last, whole[0], whole[1], known)
 
 
-def foreseen(problem: Problem, chosen: Trial, names: Sequence[str], y_scale: Array) -> dict[str, dict[str, float]]:
+def foreseen(
+    problem: Problem, chosen: CandidateFits, names: Sequence[str], y_scale: Array
+) -> dict[str, dict[str, float]]:
     """PV -> what the inputs foresee of it over rows that no fit saw: one-step errors [PV] with and without them.
 
     ``with_inputs`` and ``without`` are rms errors of two ARX alike, one of all signals, one of the PVs alone; ``model``
@@ -283,13 +293,13 @@ def foreseen(problem: Problem, chosen: Trial, names: Sequence[str], y_scale: Arr
 
 
 def proof_figures(
-    found: Mapping[tuple[int, int], Answer],
+    found: Mapping[tuple[int, int], ProvenAnswer],
     record: Record,
     scales: Scales,
     free_runs: Sequence[Mapping[str, Mapping[str, Any]]],
     noise: Array,
 ) -> dict[str, Any]:
-    """``answers``: PV -> MV -> ``Answer`` in PV/MV, with the share of the MV's moves that the PV's past explains.
+    """``answers``: PV -> MV -> ``ProvenAnswer`` in PV/MV, with the share of the MV's moves that the PV's past explains.
 
     ``free_run``: PV -> what the model misses over rows that its fit never saw, and how far the PV moved there, both
     beyond the ``noise`` (n_y,), in the PV's unit; of ``free_runs``, one a fold, together. ``share`` is the free run's
@@ -324,7 +334,7 @@ NEARER = (1.0, 0.3, 0.1, 0.03)  # how far the directions of a round lie about th
 
 
 def unused_answers(
-    answers: Mapping[tuple[int, int], Answer], unit: Array, structure: Structure, shape: tuple[int, int]
+    answers: Mapping[tuple[int, int], ProvenAnswer], unit: Array, structure: Structure, shape: tuple[int, int]
 ) -> Array:
     """Answers (n_cv, n_mv), scaled, of the pairs that no controller uses, 0 of the others.
 
@@ -344,7 +354,7 @@ def unused_answers(
     return found
 
 
-def sign_margin(answers: Mapping[tuple[int, int], Answer], rest: Array, sds: float) -> float:
+def sign_margin(answers: Mapping[tuple[int, int], ProvenAnswer], rest: Array, sds: float) -> float:
     """The least that integral action on the model's gains G is worth on plants G' that the record leaves open.
 
         min Re eig(G' G^+)

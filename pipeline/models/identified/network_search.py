@@ -11,14 +11,14 @@ import numpy as np
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.models.identified.candidates import (
     BEGINNING,
-    Start,
-    Task,
+    FitTask,
+    FoldStart,
     find_start,
     fit,
     judged_beyond_drift,
 )
 from loopwright.pipeline.models.identified.output_error import Fitted
-from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure, Trial
+from loopwright.pipeline.models.identified.structure import Budget, CandidateFits, Problem, Structure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +32,7 @@ class Rounds:
     budget: Budget
     label: str
 
-    def starts(self, structures: Sequence[Structure]) -> dict[tuple[Structure, int], Start | str]:
+    def starts(self, structures: Sequence[Structure]) -> dict[tuple[Structure, int], FoldStart | str]:
         """The starts under the shifts of some structures, on each fold."""
         tasks = [(s, fold) for s in structures for fold in range(len(self.problem.folds))]
         found = parallel_map(
@@ -40,7 +40,7 @@ class Rounds:
         )
         return dict(zip(tasks, found, strict=True))
 
-    def fits(self, tasks: Sequence[Task], name: str) -> list[Fitted | str]:
+    def fits(self, tasks: Sequence[FitTask], name: str) -> list[Fitted | str]:
         """The outcomes of some fits, in order. The dearest begin first, so that no core is left with one at the end."""
         costs = [self.budget.of(t.structure, t.iterations) for t in tasks]
         order = sorted(range(len(tasks)), key=lambda i: (-costs[i], i))
@@ -53,24 +53,24 @@ class Rounds:
             self.budget.spent += self.budget.of(tasks[i].structure, done)
         return outcomes
 
-    def trials(self, tasks: Sequence[Task], name: str) -> tuple[list[Trial], list[str]]:
+    def trials(self, tasks: Sequence[FitTask], name: str) -> tuple[list[CandidateFits], list[str]]:
         """(the candidates with the fits that succeeded, in order of their first task, reasons of the others)."""
-        trials: dict[Structure, Trial] = {}
+        trials: dict[Structure, CandidateFits] = {}
         reasons = []
         for task, outcome in zip(tasks, self.fits(tasks, name), strict=True):
             if isinstance(outcome, str):
                 reasons.append(outcome)
             else:
-                trial = trials.setdefault(task.structure, Trial(task.structure))
+                trial = trials.setdefault(task.structure, CandidateFits(task.structure))
                 trial.fits[task.fold, task.seed] = outcome
         return list(trials.values()), reasons
 
-    def judged_beyond_drift(self, trials: Sequence[Trial], rows: int) -> list[Trial]:
+    def judged_beyond_drift(self, trials: Sequence[CandidateFits], rows: int) -> list[CandidateFits]:
         """The trials with held-out errors that leave out a gain and a level of each ``rows`` rows."""
         tasks = [(t.structure, fold, fitted) for t in trials for (fold, _), fitted in t.fits.items()]
         label = f"{self.label}: errors of the models over held-out rows, slow drift left out"
         found = iter(parallel_map(partial(judged_beyond_drift, self.problem, rows), tasks, label))
-        return [Trial(t.structure, {key: next(found) for key in t.fits}) for t in trials]
+        return [CandidateFits(t.structure, {key: next(found) for key in t.fits}) for t in trials]
 
     def affordable(self, structures: Sequence[Structure], iterations: int, share: float) -> list[Structure]:
         """The first of some structures that ``iterations`` of each fit into ``share`` of the budget, one at least."""
@@ -110,9 +110,9 @@ class NetworkSearch:
     """The search among networks on some finished linear candidates."""
 
     rounds: Rounds
-    linear: Sequence[Trial]
+    linear: Sequence[CandidateFits]
 
-    def finalists(self, units: Sequence[int]) -> list[Trial]:
+    def finalists(self, units: Sequence[int]) -> list[CandidateFits]:
         """The candidates of the last round; none where the budget is spent or no number of units is given."""
         if not units or self.rounds.budget.left() <= 0:
             return []
@@ -136,12 +136,12 @@ class NetworkSearch:
         ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.rank) or quick
         return self.last_round(ranked[:LAST])
 
-    def last_round(self, trials: Sequence[Trial]) -> list[Trial]:
+    def last_round(self, trials: Sequence[CandidateFits]) -> list[CandidateFits]:
         """Candidates over all folds and as many seeds as the budget carries, one seed of one candidate at least.
 
         Fits that ``trials`` hold are gone on with.
         """
-        tasks: list[Task] = []
+        tasks: list[FitTask] = []
         left = self.rounds.budget.left()
         least, most = SEEDS
         for place in range(most):
@@ -153,30 +153,32 @@ class NetworkSearch:
                     tasks += [self._task(t.structure, k, seed, LONG, t) for k in self._folds]
         return self.rounds.trials(tasks, "the last networks, trained to the end from several starts")[0]
 
-    def corrected(self, trial: Trial, correction: float) -> list[Trial]:
+    def corrected(self, trial: CandidateFits, correction: float) -> list[CandidateFits]:
         """The candidate with another correction of its training runs, trained anew."""
-        return self.last_round([Trial(replace(trial.structure, correction=correction))])
+        return self.last_round([CandidateFits(replace(trial.structure, correction=correction))])
 
     @property
     def _folds(self) -> range:
         return range(len(self.rounds.problem.folds))
 
-    def _task(self, structure: Structure, fold: int, seed: int, iterations: int, trial: Trial | None = None) -> Task:
+    def _task(
+        self, structure: Structure, fold: int, seed: int, iterations: int, trial: CandidateFits | None = None
+    ) -> FitTask:
         """A fit, gone on from the one of ``trial`` where there is one."""
         uncorrected = replace(structure.base, correction=0.0)
         bases = (t for t in self.linear if replace(t.structure, correction=0.0) == uncorrected)
         base = next((t.fits[fold, 0] for t in bases if (fold, 0) in t.fits), None)
         begun = None if trial is None else trial.fits.get((fold, seed))
-        return Task(structure, fold, iterations, seed, base=base, begun=begun)
+        return FitTask(structure, fold, iterations, seed, base=base, begun=begun)
 
 
-def _ranked(trials: Sequence[Trial]) -> list[Trial]:
+def _ranked(trials: Sequence[CandidateFits]) -> list[CandidateFits]:
     """Trials of the first fold by their better seed, exploded ones left out."""
     finite = [t for t in trials if np.isfinite(t.of_fold(0)[0].held_out)]
     return sorted(finite, key=lambda t: (t.against, t.of_fold(0)[0].held_out))
 
 
-def _seed(trial: Trial) -> int:
+def _seed(trial: CandidateFits) -> int:
     """The seed of a trial's best fit on its first fold; 0 without one."""
     first = [(f.held_out, seed) for (fold, seed), f in trial.fits.items() if fold == 0]
     return min(first)[1] if first else 0

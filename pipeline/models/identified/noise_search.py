@@ -10,12 +10,12 @@ import numpy as np
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
-from loopwright.pipeline.models.identified.candidates import Task
+from loopwright.pipeline.models.identified.candidates import FitTask
 from loopwright.pipeline.models.identified.identified import step_responses
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
 from loopwright.pipeline.models.identified.network_search import Rounds
-from loopwright.pipeline.models.identified.structure import Problem, Structure, Trial
+from loopwright.pipeline.models.identified.structure import CandidateFits, Problem, Structure
 from loopwright.pipeline.tuning.responses import reached
 
 ITERATIONS = 20
@@ -68,20 +68,20 @@ TRAINED = 60
 """Iterations of a network's fit."""
 
 
-def nats(problem: Problem, trial: Trial, better: Trial) -> float:
+def nats(problem: Problem, trial: CandidateFits, better: CandidateFits) -> float:
     """Log-likelihood of the held-out rows by which a trial is worse than a better one, n_y n log(e/e')."""
     rows = sum(problem.folds[k].held.stop - problem.folds[k].held.start for k in trial.folds)
     return float(problem.data.y.shape[1] * rows * np.log(trial.error / better.error))
 
 
-def worse(problem: Problem, trial: Trial, best: Trial) -> float:
+def worse(problem: Problem, trial: CandidateFits, best: CandidateFits) -> float:
     """Nats by which a trial is worse than another, each state and the freedom of the whole model counting one."""
     more = trial.structure.order - best.structure.order
     plain = (trial.structure.noise == "gain") - (best.structure.noise == "gain")
     return nats(problem, trial, best) + more + plain
 
 
-def behind(problem: Problem, trial: Trial, best: Trial) -> float:
+def behind(problem: Problem, trial: CandidateFits, best: CandidateFits) -> float:
     """Nats over all rows by which a trial is worse than another, each state counting one: of two dead times.
 
     They have as many parameters, so that the rows of a fit count too. The held-out ones alone are few: 4 nats for a
@@ -92,7 +92,7 @@ def behind(problem: Problem, trial: Trial, best: Trial) -> float:
     return float(rows * np.log(ratio)) + trial.structure.order - best.structure.order
 
 
-def _of_all_rows(problem: Problem, trial: Trial) -> float:
+def _of_all_rows(problem: Problem, trial: CandidateFits) -> float:
     """The rms one-step error of the fits of all folds, over their training and their held-out rows."""
     squares = []
     for k in trial.folds:
@@ -103,11 +103,11 @@ def _of_all_rows(problem: Problem, trial: Trial) -> float:
     return float(np.sqrt(np.mean(squares)))
 
 
-def _finite(trial: Trial) -> bool:
+def _finite(trial: CandidateFits) -> bool:
     return all(np.isfinite(f.held_out) and np.isfinite(f.trained) for f in trial.fits.values())
 
 
-def likely_dead_times(problem: Problem, linear: Sequence[Trial]) -> list[tuple[int, int]]:
+def likely_dead_times(problem: Problem, linear: Sequence[CandidateFits]) -> list[tuple[int, int]]:
     """Least and most periods of dead time of each input, over the models that are as likely as the best one."""
     least = min(t.against for t in linear)
     own = [t for t in linear if t.against == least and t.structure.noise == "all" and _finite(t)]
@@ -129,7 +129,7 @@ class NoiseSearch:
         """With the impulse responses without dead time, and with the one that the first fold shows."""
         return cls(rounds, LinearSearch.of(rounds))
 
-    def linear(self, orders: Sequence[int]) -> list[Trial]:
+    def linear(self, orders: Sequence[int]) -> list[CandidateFits]:
         """The best linear candidates over all folds, the best first; ModelError where none can be fitted.
 
         Where dead times explain the rows alike, the best one of the middle of them goes first, see ``_along``.
@@ -151,7 +151,7 @@ class NoiseSearch:
             raise ModelError(f"no linear model fits the record: {why}")
         further = [self._task(t.structure, k) for t in shortlist for k in self._folds[1:]]
         others = {t.structure: t.fits for t in self.rounds.trials(further, "the best of them on all rows")[0]}
-        whole = [Trial(t.structure, {**t.fits, **others.get(t.structure, {})}) for t in shortlist]
+        whole = [CandidateFits(t.structure, {**t.fits, **others.get(t.structure, {})}) for t in shortlist]
         whole = [t for t in whole if len(t.fits) == len(self._folds) and np.isfinite(t.error)]
         whole += scanned
         whole = self.following(whole) or whole
@@ -163,7 +163,7 @@ class NoiseSearch:
         lead = next((t for t in of_middle if nats(self.rounds.problem, t, best) <= SCAN_NATS), best)
         return [lead, *(t for t in ranked if t is not lead)]
 
-    def _scanned(self, orders: Sequence[int]) -> tuple[list[Trial], tuple[int, ...]]:
+    def _scanned(self, orders: Sequence[int]) -> tuple[list[CandidateFits], tuple[int, ...]]:
         """(fits of all folds with dead times about those that are seen, ranked; the middle of those that are alike).
 
         A load hides how an answer begins, and models of few states imitate a dead time by lags: the rows then tell no
@@ -186,8 +186,8 @@ class NoiseSearch:
         return trials, at
 
     def _along(
-        self, inputs: Sequence[int], at: tuple[int, ...], orders: Sequence[int], trials: list[Trial]
-    ) -> tuple[list[Trial], tuple[int, ...]]:
+        self, inputs: Sequence[int], at: tuple[int, ...], orders: Sequence[int], trials: list[CandidateFits]
+    ) -> tuple[list[CandidateFits], tuple[int, ...]]:
         """(trials and those with dead times of some inputs beside ``at``, ranked; the median of these dead times).
 
         Each counts by its likelihood, by its distance from its neighbours, and by the square of the share of its
@@ -225,7 +225,7 @@ class NoiseSearch:
         weights = np.cumsum(apart * lags**2 * np.exp((cost.min() - cost) / UNEVEN))
         return trials, ordered[int(np.searchsorted(weights, 0.5 * weights[-1]))]
 
-    def _by_dead_time(self, trials: Sequence[Trial]) -> dict[tuple[int, ...], tuple[float, Trial]]:
+    def _by_dead_time(self, trials: Sequence[CandidateFits]) -> dict[tuple[int, ...], tuple[float, CandidateFits]]:
         """Dead times -> (nats behind the best of all, the best trial with them).
 
         Those count alone that contradict what is known the least.
@@ -233,12 +233,12 @@ class NoiseSearch:
         own = [t for t in trials if t.against == trials[0].against]
         cost = {id(t): behind(self.rounds.problem, t, own[0]) for t in own}
         least = min(cost.values())
-        found: dict[tuple[int, ...], tuple[float, Trial]] = {}
+        found: dict[tuple[int, ...], tuple[float, CandidateFits]] = {}
         for t in sorted(own, key=lambda t: cost[id(t)]):
             found.setdefault(t.structure.delays, (cost[id(t)] - least, t))
         return found
 
-    def _fitted(self, delays: Sequence[tuple[int, ...]], orders: Sequence[int]) -> list[Trial]:
+    def _fitted(self, delays: Sequence[tuple[int, ...]], orders: Sequence[int]) -> list[CandidateFits]:
         """The fits of all folds with some dead times and orders, where none explodes; the first that are affordable."""
         structures = [Structure("balanced", n, (0, 0), d, noise="all") for d in delays for n in orders]
         if not structures:
@@ -251,15 +251,15 @@ class NoiseSearch:
         trials = self.rounds.trials(tasks, "dead times")[0]
         return [t for t in trials if len(t.fits) == len(self._folds) and _finite(t)]
 
-    def _task(self, structure: Structure, fold: int) -> Task:
-        return Task(structure, fold, ITERATIONS, start=self.linears.start(structure, fold))
+    def _task(self, structure: Structure, fold: int) -> FitTask:
+        return FitTask(structure, fold, ITERATIONS, start=self.linears.start(structure, fold))
 
-    def networks(self, linear: Sequence[Trial], units: Sequence[int]) -> list[Trial]:
+    def networks(self, linear: Sequence[CandidateFits], units: Sequence[int]) -> list[CandidateFits]:
         """Networks on the best linear candidates of the first one's dead times, from several seeds, over all folds."""
         bases = [t for t in linear if t.structure.delays == linear[0].structure.delays][:UNITS_OF]
         offers = [(replace(t.structure, n_hidden=n, ridge=RIDGE, noise="all"), t) for t in bases for n in units[:2]]
         tasks = [
-            Task(s, k, TRAINED, seed, base=t.fits[k, 0]) for s, t in offers for seed in range(SEEDS) for k in t.folds
+            FitTask(s, k, TRAINED, seed, base=t.fits[k, 0]) for s, t in offers for seed in range(SEEDS) for k in t.folds
         ]
         costs = np.cumsum([self.rounds.budget.of(t.structure, t.iterations) for t in tasks])
         affordable = [t for t, cost in zip(tasks, costs, strict=True) if cost <= self.rounds.budget.left()]
@@ -267,7 +267,7 @@ class NoiseSearch:
         whole = [t for t in self.following(trials) if t.folds == linear[0].folds]
         return sorted(whole, key=lambda t: t.rank)
 
-    def following(self, trials: Sequence[Trial]) -> list[Trial]:
+    def following(self, trials: Sequence[CandidateFits]) -> list[CandidateFits]:
         """The trials without the fits whose filter explodes over the whole record, and without those of no other fits.
 
         A fit has followed the rows that it was trained on, and the held-out ones; together they begin elsewhere.
@@ -281,7 +281,7 @@ class NoiseSearch:
                 kept.append(replace(t, fits=fits))
         return kept
 
-    def ranked(self, trials: Sequence[Trial]) -> list[Trial]:
+    def ranked(self, trials: Sequence[CandidateFits]) -> list[CandidateFits]:
         """Best first, by the log-likelihood of the held-out rows less one nat a state; what is known comes before it.
 
         One-step errors hardly tell orders apart, and a state less is one less to mislead. A refined model goes before
@@ -295,7 +295,7 @@ class NoiseSearch:
         return range(len(self.rounds.problem.folds))
 
 
-def _of_lags(trial: Trial, inputs: Sequence[int], n_y: int) -> float:
+def _of_lags(trial: CandidateFits, inputs: Sequence[int], n_y: int) -> float:
     """Share of the time to half of an answer that is no dead time, the mean of some inputs' answers.
 
     For each input the answer counts of the output that it moves most, over the rows that a law looks ahead at most.

@@ -218,7 +218,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OutputError:
+class OutputErrorFit:
     """Levenberg-Marquardt for min over theta, x0 of mean (y - y_hat)^2 + ridge |theta_ridged|^2.
 
     The ridge weight is ``ridge`` times the variance of the present residual over the number of residuals, and acts on

@@ -130,7 +130,7 @@ class Budget:
 
 # ---------------------------------------------------------------------- a candidate with its fits over folds and seeds
 @dataclass(frozen=True, slots=True, eq=False)
-class Trial:
+class CandidateFits:
     """A candidate and its fits by (fold, seed)."""
 
     structure: Structure
@@ -189,7 +189,7 @@ class Trial:
         return sorted({k for k, _ in self.fits})
 
 
-def best_of(trials: Sequence[Trial]) -> Trial | None:
+def best_of(trials: Sequence[CandidateFits]) -> CandidateFits | None:
     """The trial of the least error that is finite; None without one."""
     finite = [t for t in trials if np.isfinite(t.error)]
     return min(finite, key=lambda t: t.rank) if finite else None

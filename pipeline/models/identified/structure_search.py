@@ -24,7 +24,7 @@ from loopwright.pipeline.models.identified.scaled_record import (
     may_act_in_its_row,
 )
 from loopwright.pipeline.models.identified.steady_states import INTEGRATES, slowest_pole
-from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Trial, best_of
+from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, CandidateFits, Problem, best_of
 from loopwright.pipeline.models.part import Groundwork, Source
 
 SETTLES = 0.98
@@ -56,9 +56,9 @@ WHITE = 1.01
 class Selection:
     """The outcome of a search: the best linear candidate, the best network (None without one), and all finalists."""
 
-    linear: Trial
-    network: Trial | None
-    finalists: list[Trial]
+    linear: CandidateFits
+    network: CandidateFits | None
+    finalists: list[CandidateFits]
     spent: float  # nominal seconds
     settles: bool  # whether the linear model comes to rest by itself
     drifts: bool  # whether gain or level move inside the record
@@ -84,7 +84,7 @@ class Selection:
         return bool(self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error)
 
     @property
-    def chosen(self) -> Trial:
+    def chosen(self) -> CandidateFits:
         """The network where it wins by more than its uncertainty, else the linear model."""
         return self.network if self.network is not None and self.nonlinear else self.linear
 
@@ -171,7 +171,7 @@ def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) 
     return Selection(linear[0], best, every, spent, problem.settles, False, gained, problem.farthest, alike)
 
 
-def _led_by_settling(linear: list[Trial], more: Sequence[Trial] = ()) -> list[Trial]:
+def _led_by_settling(linear: list[CandidateFits], more: Sequence[CandidateFits] = ()) -> list[CandidateFits]:
     """The trials, where the first integrates after one of them or of ``more`` that settles and stands in for it."""
     if not _integrates(linear[0]):
         return linear
@@ -179,14 +179,14 @@ def _led_by_settling(linear: list[Trial], more: Sequence[Trial] = ()) -> list[Tr
     return linear if found is None else [found, *(t for t in linear if t.structure != found.structure)]
 
 
-def _stands_in(trial: Trial, best: Trial) -> bool:
+def _stands_in(trial: CandidateFits, best: CandidateFits) -> bool:
     """Whether a trial settles in all folds and errs little more than the best, which integrates in one at least."""
     most = NEARLY if min(_slowest(best, fold) for fold in best.folds) > INTEGRATES else CONTRADICTED
     known = len(trial.fits) >= len(best.fits) and trial.against <= best.against
     return known and not _integrates(trial) and trial.error <= most * best.error
 
 
-def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
+def _settling_first(problem: Problem, linear: list[CandidateFits]) -> list[CandidateFits]:
     """Where the best integrates in a fold, one that settles in all first, if it errs as little.
 
     A load that wanders and a state of the plant that drifts are hard to tell apart one row ahead. A state that drifts
@@ -207,19 +207,19 @@ def _settling_first(problem: Problem, linear: list[Trial]) -> list[Trial]:
     return linear
 
 
-def _drift(problem: Problem, trial: Trial) -> Drift:
+def _drift(problem: Problem, trial: CandidateFits) -> Drift:
     return drift_of(trial.of_fold(trial.folds[0])[0].model, problem.whole(trial.structure))
 
 
-def _with_correction(trial: Trial, correction: float) -> Trial:
-    return Trial(replace(trial.structure, correction=correction), trial.fits)
+def _with_correction(trial: CandidateFits, correction: float) -> CandidateFits:
+    return CandidateFits(replace(trial.structure, correction=correction), trial.fits)
 
 
-def _integrates(trial: Trial) -> bool:
+def _integrates(trial: CandidateFits) -> bool:
     return max(_slowest(trial, fold) for fold in trial.folds) > INTEGRATES
 
 
-def _as_its_linear_model(problem: Problem, trial: Trial) -> Problem:
+def _as_its_linear_model(problem: Problem, trial: CandidateFits) -> Problem:
     """The problem with the test that networks have to pass, which the linear model must pass itself.
 
     A pole below ``INTEGRATES`` can be too slow to come to rest in that test, and rests of a high gain lie far off: a
@@ -233,18 +233,18 @@ def _as_its_linear_model(problem: Problem, trial: Trial) -> Problem:
     return replace(problem, settles=bool(resting), farthest=max(problem.farthest, FARTHER * largest))
 
 
-def _slowest(trial: Trial, fold: int) -> float:
+def _slowest(trial: CandidateFits, fold: int) -> float:
     """The largest magnitude of a pole of a fold's best fit."""
     return slowest_pole(trial.of_fold(fold)[0].model.plant)
 
 
-def _curved(problem: Problem, trial: Trial) -> bool:
+def _curved(problem: Problem, trial: CandidateFits) -> bool:
     fold = trial.folds[0]
     best = trial.of_fold(fold)[0]
     return curved(best.model, best.starts, problem.train(trial.structure, fold), trial.structure.correction)
 
 
-def _misses(problem: Problem, trial: Trial, ratio: float) -> bool:
+def _misses(problem: Problem, trial: CandidateFits, ratio: float) -> bool:
     fold = trial.folds[0]
     best = trial.of_fold(fold)[0]
     return misses(best.model, best.starts, problem.train(trial.structure, fold), ratio, trial.structure.correction)

@@ -24,7 +24,7 @@ from loopwright.pipeline.models.identified.steady_states import (
     settle,
     steady_gain,
 )
-from loopwright.pipeline.models.identified.structure import Problem, Trial
+from loopwright.pipeline.models.identified.structure import CandidateFits, Problem
 from loopwright.pipeline.models.identified.structure_search import Selection
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.manifest import Signal
@@ -101,7 +101,7 @@ def _judged(selection: Selection) -> str:
 
 
 def free_run_figures(
-    problem: Problem, trial: Trial, scales: Scales, names: Sequence[str], fold: int = 0
+    problem: Problem, trial: CandidateFits, scales: Scales, names: Sequence[str], fold: int = 0
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
     """(figures of each PV, {measured, free run} (n, n_y)) of a fold's best fit over the rows that it never saw.
 

@@ -15,7 +15,7 @@ from loopwright.pipeline.models.static.mlp import scaled_layers
 from loopwright.pipeline.models.training.objectives import input_jacobian
 
 
-class Linearized(NamedTuple):
+class LinearizedNetwork(NamedTuple):
     """NN(phi) and dNN/dphi at a point, shapes (..., 1) and (..., n_phi), in engineering units."""
 
     value: Tensor
@@ -35,13 +35,13 @@ class Arx(NamedTuple):
 
 
 @torch.no_grad()
-def linearize(model: NNARX, phi: Tensor) -> Linearized:
+def linearize(model: NNARX, phi: Tensor) -> LinearizedNetwork:
     """Value and slopes of an NNARX at regressors phi (..., n_phi), for a batch at once.
 
     Source: [chen2004, eqs 10, 11, 13 and 14].
     """
     rows = phi.reshape(-1, phi.shape[-1])
-    return Linearized(model(phi), input_jacobian(model.net, rows)[:, 0].reshape(phi.shape))
+    return LinearizedNetwork(model(phi), input_jacobian(model.net, rows)[:, 0].reshape(phi.shape))
 
 
 def arx(model: NNARX, phi: Tensor) -> Arx:

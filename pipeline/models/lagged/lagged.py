@@ -15,7 +15,7 @@ from loopwright.pipeline.metrics import fit_percent, r2, rmse
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.part import Learnt, Part, Source, predict
 from loopwright.pipeline.models.static.mlp import MLP
-from loopwright.pipeline.models.training.objectives import Windows, free_run
+from loopwright.pipeline.models.training.objectives import FreeRunWindows, free_run
 from loopwright.pipeline.models.training.regressors import Pairs, nnarx_pairs
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
@@ -44,9 +44,11 @@ class LaggedModel(Model):
         """Pairs (phi(t), y(t)) of a record, y the PV ``target``; raises RecordError."""
         return nnarx_pairs(record, self.n_y, self.n_u, target, self.delay)
 
-    def windows(self, record: Record, steps: int, target: int = 0, *, every: int = 1, least_back: int = 0) -> Windows:
-        """``Windows.of`` the record for this model's lags; raises RecordError."""
-        return Windows.of(
+    def windows(
+        self, record: Record, steps: int, target: int = 0, *, every: int = 1, least_back: int = 0
+    ) -> FreeRunWindows:
+        """``FreeRunWindows.of`` the record for this model's lags; raises RecordError."""
+        return FreeRunWindows.of(
             record, self.n_y, self.n_u, steps, target=target, delay=self.delay, every=every, least_back=least_back
         )
 
@@ -55,7 +57,7 @@ class LaggedModel(Model):
         return free_run(self, past, u, self.n_u)
 
     @torch.no_grad()
-    def free_run(self, cut: Windows) -> Array:
+    def free_run(self, cut: FreeRunWindows) -> Array:
         """The free run over windows, shape (N, k)."""
         return np.asarray(self.simulate(torch.from_numpy(cut.past), torch.from_numpy(cut.u)).numpy())
 

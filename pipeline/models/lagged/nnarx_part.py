@@ -36,7 +36,7 @@ class Size:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class SizeCandidate:
     """One row of the search: the model's size and its validation errors [unit of the PV].
 
     ``rmse`` is of one step, ``free_run_rmse`` of all steps of free runs over validation data.
@@ -50,10 +50,10 @@ class Candidate:
     free_run_rmse: float
 
 
-Trial = tuple[NNARX, FitHistory, dict[str, LongRun], Candidate]
+Trial = tuple[NNARX, FitHistory, dict[str, LongRun], SizeCandidate]
 
 
-def parsimonious(candidates: Sequence[Candidate], slack: float = SLACK) -> int:
+def parsimonious(candidates: Sequence[SizeCandidate], slack: float = SLACK) -> int:
     """Index of the one with the fewest parameters among those within ``slack`` of the best free run.
 
     Differences of a few per cent between free-run errors lie within what another draw of the
@@ -177,7 +177,7 @@ class NnarxPart(Part):
             error = float(free.loss(model.net).sqrt() * model.net.y_scale)
         size = sum(p.numel() for p in model.parameters())
         one_step_error = rmse(held.y, predict(model, held.x))
-        return model, history, runs, Candidate(self.n_y, self.n_u, self.hidden, size, one_step_error, error)
+        return model, history, runs, SizeCandidate(self.n_y, self.n_u, self.hidden, size, one_step_error, error)
 
 
 def _trial_of(given: tuple[Record, Record, int, int, int], size: NnarxPart) -> Trial:

@@ -110,7 +110,7 @@ class RecursiveLeastSquares(nn.Module):
         return torch.stack(predicted), theta, root
 
 
-class Sample(NamedTuple):
+class ArxSample(NamedTuple):
     """x(t), x(t+1) with u(t) = u(t-1), (..., n) each, and psi(t) (..., 1)."""
 
     x: Tensor
@@ -118,7 +118,7 @@ class Sample(NamedTuple):
     psi: Tensor
 
 
-class Estimate(NamedTuple):
+class ArxEstimate(NamedTuple):
     """Parameters theta (..., n) with what this sample taught; what a law asks of them, and remembers.
 
     ``slope`` (..., 1) [pv] is that of y(t+1) over one unit of move.
@@ -194,13 +194,13 @@ class RecursiveArx(nn.Module):
             "root": Slot(self.size**2, rls.start(self.size).flatten()),
         }
 
-    def sample(self, p: Named) -> Sample:
+    def sample(self, p: Named) -> ArxSample:
         """Regressors from the past and the sample, scaled."""
         now, ahead = (self._scaled(x) for x in regressors(p, self.n_y, self.n_u))
         eta = (p["y"] - self.middle_y) / self.half_y
         for i, weight in enumerate(self.prefilter):
             eta = eta + weight * now[..., i : i + 1]
-        return Sample(now, ahead, eta)
+        return ArxSample(now, ahead, eta)
 
     def output(self, x: Tensor, theta: Tensor) -> Tensor:
         """theta'x, shape (..., 1), of x and theta (..., n)."""
@@ -211,7 +211,7 @@ class RecursiveArx(nn.Module):
         one = torch.ones_like(phi[..., :1])
         return torch.cat([(y - self.middle_y) / self.half_y, (u - self.middle_u) / self.unit, one], dim=-1)
 
-    def forward(self, p: Named, sample: Sample) -> Estimate:
+    def forward(self, p: Named, sample: ArxSample) -> ArxEstimate:
         """The parameters after this sample."""
         theta, flat = p["theta"], p["root"]
         root = flat.reshape(*flat.shape[:-1], self.size, self.size)
@@ -219,4 +219,4 @@ class RecursiveArx(nn.Module):
         complete = p["seen"][..., -1:]
         theta, root, _ = self.rls(theta, root, complete * sample.x, sample.psi)
         slope = theta[..., self.n_y : self.n_y + 1] * self.pv_unit
-        return Estimate(theta, slope, {"theta": theta, "root": root.flatten(-2)})
+        return ArxEstimate(theta, slope, {"theta": theta, "root": root.flatten(-2)})

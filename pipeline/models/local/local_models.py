@@ -135,7 +135,7 @@ def spacing(at: Array) -> Array:
     return found
 
 
-class Linearized(Model):
+class LinearizedPlant(Model):
     """A plant linearized at a steady state and sampled with its MV held.
 
         x' = A (x - x0) + B (u - u0),   pv = pv0 + C (x - x0)
@@ -195,12 +195,12 @@ class Linearized(Model):
 class LinearizedPart(Part):
     """The plant's own equations, linearized at the steady state with controlled variable ``at``."""
 
-    model: ClassVar[type[Model]] = Linearized
+    model: ClassVar[type[Model]] = LinearizedPlant
     at: float
 
     def learn(self, source: Source) -> Learnt:
         """The linearization; needs no data."""
-        model = Linearized.at_set_point(equations(source.plant, "a part of kind 'linearized'"), self.at)
+        model = LinearizedPlant.at_set_point(equations(source.plant, "a part of kind 'linearized'"), self.at)
         lin = model.linearization()
         metrics = {
             "eigenvalues": [[float(v.real), float(v.imag)] for v in lin.eigenvalues],

@@ -18,7 +18,7 @@ from loopwright.pipeline.plants.simulator import Array
 COLLINEAR = 1e-10
 
 
-class Interval(NamedTuple):
+class DomainInterval(NamedTuple):
     """The values of w inside the domain at a state: centre +- half, while room > 0."""
 
     centre: Tensor  # (..., 1) [w] global linear prediction of w from the state
@@ -106,14 +106,14 @@ class LeverageDomain(Model):
         }
         return cls.from_arrays({"n_in": n}, numbers)
 
-    def interval(self, x: Tensor) -> Interval:
+    def interval(self, x: Tensor) -> DomainInterval:
         """The interval of w at states ``x``, shape (..., N-1)."""
         along = (x - self.mean_x) @ self.project
         spread = along[..., :-1]
         room = self.free - (spread * spread).sum(dim=-1, keepdim=True)
-        return Interval(self.mean_w + along[..., -1:], self.scale * room.relu().sqrt(), room)
+        return DomainInterval(self.mean_w + along[..., -1:], self.scale * room.relu().sqrt(), room)
 
-    def leverage(self, at: Interval, w: Tensor) -> Tensor:
+    def leverage(self, at: DomainInterval, w: Tensor) -> Tensor:
         """Leverage (..., 1) of w, shape (..., 1), at the state of an interval."""
         away = (w - at.centre) / self.scale
         return self.threshold - at.room + away * away
@@ -126,7 +126,7 @@ class LeverageDomain(Model):
         """Leverage, shape (..., 1), of inputs [state, w], shape (..., N)."""
         return self.leverage(self.interval(x[..., :-1]), x[..., -1:])
 
-    def bounds(self, at: Interval, y: Tensor, r: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
+    def bounds(self, at: DomainInterval, y: Tensor, r: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Narrowed bounds (w_min, w_max), each (..., 1), by the factor r >= 1.
 
         Eqs 18 and 19 as centre -+ half/r. Where no w is inside, both are the output y (..., 1): to

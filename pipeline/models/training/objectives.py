@@ -149,7 +149,7 @@ class Samples(Rows):
     def normal_equations(self, net: MLP, chunk: int) -> tuple[Tensor, Tensor, Tensor]:
         """(loss, J'r, J'J)."""
         x, target, root = self._tensors(net)
-        sums = Sums(net)
+        sums = JacobianSums(net)
         for rows in chunks(len(self), chunk):
             s, jac = parameter_jacobian(net, x[rows])
             sums.add((s - target[rows]) * root[rows, None], jac.mul_(root[rows, None, None]))
@@ -157,7 +157,7 @@ class Samples(Rows):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Windows(Rows):
+class FreeRunWindows(Rows):
     """Free-run error of an NNARX over k steps: mean over windows and steps of (s_t - s*_t)^2.
 
     Inside a window the model is fed its own predictions; k = 1 is the one-step error. The Jacobian
@@ -229,7 +229,7 @@ class Windows(Rows):
         """(loss, J'r, J'J)."""
         past, u, future = (torch.from_numpy(a) for a in (self.past, self.u, self.future))
         root, n_y, n_u = self._root(net), self.past.shape[1], self.u.shape[1] - self.steps + 1
-        sums = Sums(net)
+        sums = JacobianSums(net)
         for rows in chunks(len(self), chunk):
             ys = list(past[rows].unbind(1))
             sensitivities: list[Tensor] = []  # dy/dtheta of the predictions; measured PVs have none
@@ -269,7 +269,7 @@ def free_run(predictor: Callable[[Tensor], Tensor], past: Tensor, u: Tensor, n_u
     return torch.stack(ys[n_y:], dim=-1)
 
 
-class Sums:
+class JacobianSums:
     """Running sums of r'r, J'r and J'J."""
 
     def __init__(self, net: MLP) -> None:

@@ -19,7 +19,7 @@ INSTALL = "pip install 'loopwright[fmu]'"
 
 
 @dataclass(frozen=True, slots=True)
-class Variable:
+class FmuVariable:
     """A real variable; None where the FMU states no value."""
 
     name: str
@@ -38,7 +38,7 @@ class Description:
 
     path: Path
     version: int  # of FMI: 2 or 3
-    variables: dict[str, Variable] = field(repr=False)  # scalar and real ones, by name
+    variables: dict[str, FmuVariable] = field(repr=False)  # scalar and real ones, by name
     others: dict[str, str] = field(repr=False)  # name -> type of those that are neither
     begins_s: float
     step_s: float | None  # proposed communication step
@@ -106,12 +106,12 @@ def described(path: Path) -> Description:
     )
 
 
-def _variable(v: Any) -> Variable:
+def _variable(v: Any) -> FmuVariable:
     kind = v.declaredType
     unit, low, high = (getattr(v, key) or (kind and getattr(kind, key)) for key in ("unit", "min", "max"))
     text = str(v.start).split()
     start = _number(text[0]) if v.start is not None and text else None
-    return Variable(
+    return FmuVariable(
         v.name, v.valueReference, v.causality, unit or "", _number(low), _number(high), start, v.description or ""
     )
 

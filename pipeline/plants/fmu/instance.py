@@ -146,7 +146,7 @@ Play = Callable[[Instance, bytes], None]
 """Does a move on an instance: sets its inputs and steps it on, as the move's bytes say."""
 
 
-class Memory(Protocol):
+class FmuMemory(Protocol):
     """Instances of an FMU, and how a vector (n,) of finite numbers names a state of theirs."""
 
     def start(self) -> tuple[Instance, Array]:
@@ -156,7 +156,7 @@ class Memory(Protocol):
         """An instance after a move from a state, and its state."""
 
 
-def memory_of(of: Description, folder: Path, play: Play) -> Memory:
+def memory_of(of: Description, folder: Path, play: Play) -> FmuMemory:
     """States as bytes where the FMU writes them and they are not too large; else by replaying what led to them."""
     first = Instance(of, folder)
     first.begin()

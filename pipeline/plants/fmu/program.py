@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 
 from loopwright.pipeline.errors import PlantError, nearest
-from loopwright.pipeline.plants.fmu.description import Description, FmuTable, Variable, described, fmpy
+from loopwright.pipeline.plants.fmu.description import Description, FmuTable, FmuVariable, described, fmpy
 from loopwright.pipeline.plants.fmu.instance import Instance, memory_of
 from loopwright.pipeline.plants.program import Interface
 from loopwright.pipeline.plants.simulator import Array
@@ -29,7 +29,7 @@ PREFIX, LOCK = "loopwright-fmu-", "in-use.lock"
 
 
 @final
-class Folder:
+class UnpackedFmu:
     """An FMU unpacked: its libraries for this machine and its resources.
 
     An FMU without resources needs its folder no more once it is loaded (``loaded``). Else the folder goes with this
@@ -131,7 +131,7 @@ class FmuFile:
         self._n_mv, self._rest = len(mv), table.rest_periods
         groups = {role: tuple(r.signal for r in table.of(role)) for role in ("pv", "mv", "dv")}
         self.interface = Interface(table.step_s, groups["pv"], groups["mv"], groups["dv"], strides=self._of.any_step)
-        self._folder = Folder(self._of)
+        self._folder = UnpackedFmu(self._of)
         play = partial(_play, self._inputs, table.step_s)  # not a method: the FMU ends with the last reference to it
         self._memory = memory_of(self._of, self._folder.path, play)
         self._folder.loaded()
@@ -170,7 +170,7 @@ class FmuFile:
         return np.concatenate([instance.get(self._outputs), [periods], state])
 
 
-def variable_of(of: Description, name: str, role: str) -> Variable:
+def variable_of(of: Description, name: str, role: str) -> FmuVariable:
     """The variable of a role; PlantError where there is none of that name, or it cannot take the role."""
     if name not in of.variables:
         if name in of.others:

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopwright.pipeline.models.identified.model_validation import MOST_OPEN, Answer, sign_margin, unused_answers
+from loopwright.pipeline.models.identified.model_validation import MOST_OPEN, ProvenAnswer, sign_margin, unused_answers
 from loopwright.pipeline.models.identified.structure import Structure
 
-CERTAIN = Answer(1.0, 0.9, 1.1, 1, 9, 1.0, 0.05)
+CERTAIN = ProvenAnswer(1.0, 0.9, 1.1, 1, 9, 1.0, 0.05)
 GAINS = np.array([[1.0, 0.3, -0.1], [-0.3, 0.8, 0.2], [0.4, -0.2, 1.0]])
 
 
-def answers_of(gains: np.ndarray, sd: dict[tuple[int, int], float]) -> dict[tuple[int, int], Answer]:
+def answers_of(gains: np.ndarray, sd: dict[tuple[int, int], float]) -> dict[tuple[int, int], ProvenAnswer]:
     """An answer of each pair, certain unless a larger ``sd`` is given."""
     return {
         (i, j): replace(CERTAIN, model=g, low=0.9 * g, high=1.1 * g, direct=g, sd=sd.get((i, j), 0.05 * abs(g)))
@@ -83,7 +83,7 @@ def test_too_many_open_answers_or_one_without_a_number_prove_nothing() -> None:
     every = dict.fromkeys(np.ndindex(3, 3), 1.0)
     assert len(every) > MOST_OPEN
     assert sign_margin(answers_of(gains, every), np.zeros((3, 3)), 2.0) == -np.inf
-    unknown = answers_of(gains, {}) | {(0, 1): Answer(0.2, 0.1, 0.3, 1, 9)}
+    unknown = answers_of(gains, {}) | {(0, 1): ProvenAnswer(0.2, 0.1, 0.3, 1, 9)}
     assert sign_margin(unknown, np.zeros((3, 3)), 2.0) == -np.inf
 
 

@@ -22,7 +22,7 @@ from loopwright.pipeline.models.identified.innovations import (
     typical,
     with_loads,
 )
-from loopwright.pipeline.models.identified.output_error import OutputError, residuals, sensitivity_sums
+from loopwright.pipeline.models.identified.output_error import OutputErrorFit, residuals, sensitivity_sums
 
 Array = np.ndarray
 
@@ -132,7 +132,7 @@ def test_fits_find_the_plant_under_a_wandering_load_where_free_runs_do_not() -> 
         _, data = loaded(seed=seed)
         for found, model in (
             (by_steps, PredictionError(iterations=30).fit(begun(wrong, [data]), [data]).model.plant),
-            (by_runs, OutputError(iterations=30).fit(wrong, [data]).model),
+            (by_runs, OutputErrorFit(iterations=30).fit(wrong, [data]).model),
         ):
             found.append(float(model.b[0, 0] / (1 - model.a[0, 0])))
     assert np.mean(by_steps) == pytest.approx(2.0, rel=0.05)

@@ -18,7 +18,7 @@ from loopwright.pipeline.models.identified.knowledge import Knowledge, Pair
 from loopwright.pipeline.models.identified.linear_search import smallest_first
 from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
-from loopwright.pipeline.models.identified.structure import Structure, Trial, best_of
+from loopwright.pipeline.models.identified.structure import CandidateFits, Structure, best_of
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.records.record import Record
@@ -161,13 +161,13 @@ def test_a_model_contradicts_what_is_known_by_its_gain(pair: Pair, model: Dynami
     assert bool(Knowledge((pair,), 1).against(model, rows)) is against
 
 
-def trial(order: int, error: float, *against: bool) -> Trial:
+def trial(order: int, error: float, *against: bool) -> CandidateFits:
     """With a fit a fold."""
     fits = {
         (k, 0): Fitted(first_order(1.0), [], error, error, 1, frozenset({0}) if a else frozenset())
         for k, a in enumerate(against)
     }
-    return Trial(Structure("balanced", order, (0, 0), (0,)), fits)
+    return CandidateFits(Structure("balanced", order, (0, 0), (0,)), fits)
 
 
 def test_candidates_that_contradict_what_is_known_rank_behind_all_that_agree() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from closed_loop_records import LOOPS, SIGNALS
 
-from loopwright.pipeline.models.identified.candidates import Task, on_all_rows
+from loopwright.pipeline.models.identified.candidates import FitTask, on_all_rows
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.innovations import innovations
@@ -19,7 +19,7 @@ from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.noise_search import NoiseSearch
 from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.scaled_record import Fold
-from loopwright.pipeline.models.identified.structure import Budget, Problem, Structure, Trial
+from loopwright.pipeline.models.identified.structure import Budget, CandidateFits, Problem, Structure
 from loopwright.pipeline.models.part import Learnt, Source
 
 QUICK = IdentifiedPart(units=(), orders=(2, 2))
@@ -101,14 +101,14 @@ def searched_over(
     search = NoiseSearch(rounds, LinearSearch(rounds, {(of, 0): "none" for of in shown}))
     tried = []
 
-    def trials(_: Rounds, tasks: list[Task], name: str) -> tuple[list[Trial], list[str]]:
+    def trials(_: Rounds, tasks: list[FitTask], name: str) -> tuple[list[CandidateFits], list[str]]:
         model, found = Dynamics.linear(np.array([[0.95]]), np.array([[1.0]])), []
         for task in tasks:
             (d,) = task.structure.delays
             tried.append(d)
             error = errors.get(d, 2.0)
             found.append(
-                Trial(task.structure, {(0, 0): Fitted(model, [], np.inf if d == exploded else error, error, 1)})
+                CandidateFits(task.structure, {(0, 0): Fitted(model, [], np.inf if d == exploded else error, error, 1)})
             )
         return found, []
 

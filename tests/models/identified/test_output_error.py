@@ -16,7 +16,7 @@ from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.output_error import (
     CHUNK,
     Equations,
-    OutputError,
+    OutputErrorFit,
     fit_starts,
     free_run_error,
     residuals,
@@ -166,7 +166,7 @@ def test_a_nonlinear_system_is_fitted_down_to_its_noise() -> None:
     rng = np.random.default_rng(0)
     theta = truth.vector()
     start = truth.with_vector(theta + 0.05 * rng.normal(size=len(theta)))
-    fitted = OutputError(iterations=30).fit(start, [data], [held])
+    fitted = OutputErrorFit(iterations=30).fit(start, [data], [held])
     assert fitted.trained == pytest.approx(0.1, rel=0.1)
     assert fitted.held_out < 0.115
     assert free_run_error(start, [held])[0][0] > 1.3 * fitted.held_out
@@ -175,7 +175,7 @@ def test_a_nonlinear_system_is_fitted_down_to_its_noise() -> None:
 def test_what_is_not_free_stays() -> None:
     model = drawn(1, 1, 2, 0, 2)
     data = stretch(drawn(1, 1, 2, 0, 3), 1, 200, 1, 0.1)
-    fitted = OutputError(iterations=5).fit(model, [data], free=model.mask(b=True, c=True))
+    fitted = OutputErrorFit(iterations=5).fit(model, [data], free=model.mask(b=True, c=True))
     assert np.array_equal(fitted.model.a, model.a)
     assert not np.array_equal(fitted.model.b, model.b)
 
@@ -185,7 +185,7 @@ def test_a_ridge_shrinks_the_nonlinear_weights() -> None:
     data = stretch(truth, 1, 400, 1, 0.3)
     sizes = [
         float(np.sum(f.model.w1**2) + np.sum(f.model.w2**2))
-        for f in (OutputError(iterations=15, ridge=r).fit(truth, [data]) for r in (0.0, 300.0))
+        for f in (OutputErrorFit(iterations=15, ridge=r).fit(truth, [data]) for r in (0.0, 300.0))
     ]
     assert sizes[1] < 0.8 * sizes[0]
 
@@ -216,7 +216,7 @@ def test_a_model_of_another_layout_in_memory_is_not_compiled_anew(monkeypatch: p
 def test_the_same_data_give_the_same_bytes() -> None:
     model = drawn(1, 1, 3, 2, 4)
     data = [stretch(drawn(1, 1, 2, 1, 9), 1, 200, 1, 0.1)]
-    first, second = (OutputError(iterations=4).fit(model, data).model.vector() for _ in range(2))
+    first, second = (OutputErrorFit(iterations=4).fit(model, data).model.vector() for _ in range(2))
     assert first.tobytes() == second.tobytes()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from closed_loop_records import OperatedLoop
 
-from loopwright.pipeline.models.identified.model_validation import Answer, Region, answers, proof_figures
+from loopwright.pipeline.models.identified.model_validation import ProvenAnswer, Region, answers, proof_figures
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.structure import Structure
 
@@ -32,24 +32,27 @@ GOOD = {"model": 2.0, "low": 1.8, "high": 2.2, "first": 5, "last": 9, "direct": 
     ],
 )
 def test_what_speaks_against_an_answer(changed: dict[str, float], verdict: str) -> None:
-    assert Answer(**{**GOOD, **changed}).verdict == verdict
+    assert ProvenAnswer(**{**GOOD, **changed}).verdict == verdict
 
 
 def test_units_scale_all_that_has_one() -> None:
-    found = Answer(**GOOD, regions=(Region(-1.0, 0.5, True, Answer(**GOOD)),)).times(10.0, 40.0, 50.0)
+    found = ProvenAnswer(**GOOD, regions=(Region(-1.0, 0.5, True, ProvenAnswer(**GOOD)),)).times(10.0, 40.0, 50.0)
     assert (found.model, found.direct, found.sd) == (20.0, 19.0, 2.0)
     assert (found.first, found.halves, found.verdict) == (5, (8.0, 7.0), "proven")
     (region,) = found.regions
     assert (region.start, region.end, region.answer.low, region.small) == (10.0, 70.0, 18.0, True)
     assert [of["from"] for of in found.to_dict()["regions"]] == [10.0]
-    assert "regions" not in Answer(**GOOD).to_dict()
+    assert "regions" not in ProvenAnswer(**GOOD).to_dict()
 
 
-UP, DOWN = Answer(**GOOD), Answer(**{**GOOD, "model": -1.0, "low": -1.1, "high": -0.9, "direct": -1.0, "halves": ()})
+UP, DOWN = (
+    ProvenAnswer(**GOOD),
+    ProvenAnswer(**{**GOOD, "model": -1.0, "low": -1.1, "high": -0.9, "direct": -1.0, "halves": ()}),
+)
 MEAN = {**GOOD, "model": 0.1, "low": -0.1}  # of a gain that turns: uncertain
 
 
-def regions(*of: Answer, small: tuple[int, ...] = ()) -> tuple[Region, ...]:
+def regions(*of: ProvenAnswer, small: tuple[int, ...] = ()) -> tuple[Region, ...]:
     return tuple(Region(float(i), i + 1.0, i in small, answer) for i, answer in enumerate(of))
 
 
@@ -60,24 +63,24 @@ def regions(*of: Answer, small: tuple[int, ...] = ()) -> tuple[Region, ...]:
         ({"direct": -1.9}, (UP, DOWN), "turns"),  # the mean over the regions has the other sign by right
         ({}, (UP, UP), "fades"),
         ({"low": 1.8, "model": 2.0}, (UP, DOWN), "proven"),
-        ({}, (UP, Answer(**{**GOOD, "direct": -1.9})), "uncertain"),  # a region speaks against its model
-        ({}, (UP, Answer(**{**GOOD, "halves": (8.0, -2.5)})), "uncertain"),
-        ({}, (UP, Answer(**{**GOOD, "sd": 0.7})), "fades"),  # uncertain in a region is no contradiction yet
+        ({}, (UP, ProvenAnswer(**{**GOOD, "direct": -1.9})), "uncertain"),  # a region speaks against its model
+        ({}, (UP, ProvenAnswer(**{**GOOD, "halves": (8.0, -2.5)})), "uncertain"),
+        ({}, (UP, ProvenAnswer(**{**GOOD, "sd": 0.7})), "fades"),  # uncertain in a region is no contradiction yet
     ],
 )
 def test_an_answer_that_changes_is_judged_by_its_regions(
-    changed: dict[str, float], by: tuple[Answer, ...], verdict: str
+    changed: dict[str, float], by: tuple[ProvenAnswer, ...], verdict: str
 ) -> None:
-    assert Answer(**{**MEAN, **changed}, regions=regions(*by)).verdict == verdict
+    assert ProvenAnswer(**{**MEAN, **changed}, regions=regions(*by)).verdict == verdict
 
 
 def test_a_region_of_small_gain_decides_nothing() -> None:
-    against = Answer(**{**GOOD, "direct": -1.9})
-    assert Answer(**MEAN, regions=regions(UP, against, DOWN, small=(1,))).verdict == "turns"
-    assert Answer(**MEAN, regions=regions(against, small=(0,))).verdict == "uncertain"
+    against = ProvenAnswer(**{**GOOD, "direct": -1.9})
+    assert ProvenAnswer(**MEAN, regions=regions(UP, against, DOWN, small=(1,))).verdict == "turns"
+    assert ProvenAnswer(**MEAN, regions=regions(against, small=(0,))).verdict == "uncertain"
 
 
-def of(loop: OperatedLoop, curve: np.ndarray, structure: Structure = PLAIN) -> Answer:
+def of(loop: OperatedLoop, curve: np.ndarray, structure: Structure = PLAIN) -> ProvenAnswer:
     """Of a model whose answer to a step of 1 % is ``curve`` (LENGTH,) [degC]."""
     record = loop.record(2_400, 4)
     scales = Scales.of(record, 1)

@@ -16,7 +16,7 @@ from loopwright.pipeline.models.identified.network_search import Rounds, _offers
 from loopwright.pipeline.models.identified.noise_search import NoiseSearch
 from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.scaled_record import Fold
-from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, Problem, Structure, Trial
+from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, CandidateFits, Problem, Structure
 from loopwright.pipeline.models.identified.structure_search import (
     _as_its_linear_model,
     _led_by_settling,
@@ -36,14 +36,14 @@ def fit(held_out: float, *against: int, pole: float = 0.9) -> Fitted:
 
 def test_an_exploded_fit_comes_after_one_that_contradicts_what_is_known() -> None:
     wild, usable = fit(np.inf), fit(0.3, 0)
-    trial = Trial(STRUCTURE, {(0, 0): wild, (0, 1): usable})
+    trial = CandidateFits(STRUCTURE, {(0, 0): wild, (0, 1): usable})
     assert trial.of_fold(0)[0] is usable
     assert trial.against == 1
 
 
 def test_a_candidate_of_fewer_folds_comes_last_whatever_it_contradicts() -> None:
-    whole = Trial(STRUCTURE, {(0, 0): fit(0.3, 0), (1, 0): fit(0.3, 0)})
-    part = Trial(Structure("balanced", 2, (0, 0), (0,)), {(0, 0): fit(0.9, 0)})
+    whole = CandidateFits(STRUCTURE, {(0, 0): fit(0.3, 0), (1, 0): fit(0.3, 0)})
+    part = CandidateFits(Structure("balanced", 2, (0, 0), (0,)), {(0, 0): fit(0.9, 0)})
     assert smallest_first([part, whole])[0] is whole
 
 
@@ -62,9 +62,9 @@ def two_folds() -> Problem:
     return Problem(data, folds, 1)
 
 
-def trial(error: float, *poles: float) -> Trial:
+def trial(error: float, *poles: float) -> CandidateFits:
     """A candidate with a pole in each fold."""
-    return Trial(STRUCTURE, {(k, 0): fit(error, pole=pole) for k, pole in enumerate(poles)})
+    return CandidateFits(STRUCTURE, {(k, 0): fit(error, pole=pole) for k, pole in enumerate(poles)})
 
 
 def test_a_state_that_drifts_is_a_loads_where_a_model_that_settles_errs_as_little() -> None:
@@ -93,7 +93,9 @@ def test_a_state_that_drifts_is_a_loads_where_a_model_that_settles_errs_as_littl
         (trial(1.0, 0.9999, 1.003), trial(1.2, 0.9, 0.9), False),
     ],
 )
-def test_an_integrator_shows_in_all_parts_of_an_open_record(best: Trial, other: Trial, stands_in: bool) -> None:
+def test_an_integrator_shows_in_all_parts_of_an_open_record(
+    best: CandidateFits, other: CandidateFits, stands_in: bool
+) -> None:
     assert _stands_in(other, best) is stands_in
 
 
@@ -111,13 +113,13 @@ class Found:
     """A search among models with their noise that is over."""
 
     rounds: Any
-    ranked: list[Trial]
-    network: Trial
+    ranked: list[CandidateFits]
+    network: CandidateFits
 
-    def linear(self, orders: Any) -> list[Trial]:
+    def linear(self, orders: Any) -> list[CandidateFits]:
         return self.ranked
 
-    def networks(self, linear: Any, units: Any) -> list[Trial]:
+    def networks(self, linear: Any, units: Any) -> list[CandidateFits]:
         return [self.network]
 
 
@@ -127,7 +129,7 @@ def test_a_network_gains_nothing_by_what_the_linear_model_gave_away_to_settle(
 ) -> None:
     """The model that settles is 4 nats worse than the one that integrates; a network as good as that one is no gain."""
     ranked = [trial(1.0, 1.0, 0.9995), trial(1.002, 0.9, 0.9)]
-    network = Trial(replace(STRUCTURE, n_hidden=4), trial(error, 0.9, 0.9).fits)
+    network = CandidateFits(replace(STRUCTURE, n_hidden=4), trial(error, 0.9, 0.9).fits)
     monkeypatch.setattr(NoiseSearch, "of", lambda rounds: Found(rounds, ranked, network))
     found = by_innovations(Rounds(two_folds(), Budget(1.0, 2_000, 1), ""), (1,), (4,))
     assert found.linear is ranked[1]

@@ -15,7 +15,7 @@ from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
 from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.steady_states import INTEGRATES, slowest_pole
-from loopwright.pipeline.models.identified.structure import Budget, Structure, Trial
+from loopwright.pipeline.models.identified.structure import Budget, CandidateFits, Structure
 from loopwright.pipeline.models.identified.structure_search import Searched
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.records.record import Record
@@ -88,7 +88,7 @@ def test_a_pole_at_one_stays_only_where_the_plant_integrates(record: Record, int
     search = LinearSearch.of(Rounds(problem, Budget(60.0, len(record), 1), "search"))
     trial = search.finish(search.first_round([2], 0.0))[0]
     at_one = {k: replace(f, model=replace(f.model, a=pole_at_one(f.model.a))) for k, f in trial.fits.items()}
-    again = search.settling([Trial(trial.structure, at_one)])[0]
+    again = search.settling([CandidateFits(trial.structure, at_one)])[0]
     poles = [np.abs(np.linalg.eigvals(f.model.a)).max() for f in again.fits.values()]
     assert bool(min(poles) > 0.995) is integrates
     assert again.error == pytest.approx(trial.error, rel=0.05)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
-from loopwright.pipeline.models.identified.output_error import OutputError, fit_starts
+from loopwright.pipeline.models.identified.output_error import OutputErrorFit, fit_starts
 from loopwright.pipeline.models.identified.parameter_uncertainty import drawn
 
 TRUE = Dynamics.linear(np.array([[0.9]]), np.array([[0.2]]))
@@ -33,7 +33,7 @@ def gain(model: Dynamics) -> float:
 
 @pytest.mark.parametrize("colour", [0.0, 0.8])
 def test_the_spread_of_draws_is_that_of_other_records(colour: float) -> None:
-    fits = [OutputError(iterations=8).fit(TRUE, [record(seed, colour)]) for seed in range(1, 26)]
+    fits = [OutputErrorFit(iterations=8).fit(TRUE, [record(seed, colour)]) for seed in range(1, 26)]
     across = np.std([gain(f.model) for f in fits])
     found = []
     for seed in (1, 2, 3, 4):

@@ -97,7 +97,7 @@ def run_on_grid(
                 before(k)
             except Exception as error:
                 reason = reason or f"before failed: {named(error)}"
-        sample, command = _exchange(loop, endpoint, reason)
+        sample, command = _scan_once(loop, endpoint, reason)
         scans += 1
         faults += bool(command.reason)
         if observe is not None:
@@ -120,7 +120,7 @@ def _wait(loop: ControlLoop, deadline: float, failures: Failures) -> float:
     return max(0.0, late)
 
 
-def _exchange(loop: ControlLoop, endpoint: Endpoint, reason: str) -> tuple[Sample | None, Command]:
+def _scan_once(loop: ControlLoop, endpoint: Endpoint, reason: str) -> tuple[Sample | None, Command]:
     """Read, scan, write; a ``reason`` or a failing endpoint gives a command that holds the MV."""
     sample, last = None, loop.mv
     try:

@@ -20,7 +20,7 @@ from loopwright.serving.words import named
 Array: TypeAlias = NDArray[np.float64]
 
 
-class Fitted(Controller):
+class AdaptedController(Controller):
     """A controller that gets its own PVs and measured disturbances out of a loop's, by name.
 
     Its ``manifest`` has all signals of the loop, so that whoever reads, judges, shows or writes down a scan does so as
@@ -59,7 +59,7 @@ class Fitted(Controller):
         self.inner.warm()
 
 
-def fitted(controller: Controller, loop: Manifest) -> Controller:
+def adapted(controller: Controller, loop: Manifest) -> Controller:
     """``controller`` for a loop that reads the signals of ``loop``: itself where it reads all of them.
 
     LoopError where it cannot take over there: another period, a signal that the loop does not read, another order of
@@ -67,11 +67,15 @@ def fitted(controller: Controller, loop: Manifest) -> Controller:
     these belong to the actuator. The ranges of set points and PVs say where a controller was proven, and may be others.
     """
     require_fits(controller.manifest, loop)
-    return controller if _seen_as(controller.manifest, loop) == controller.manifest else Fitted(controller, loop)
+    return (
+        controller
+        if _seen_as(controller.manifest, loop) == controller.manifest
+        else AdaptedController(controller, loop)
+    )
 
 
 def require_fits(own: Manifest, loop: Manifest) -> None:
-    """LoopError where a controller of ``own`` cannot take over in a loop that reads ``loop``; see ``fitted``."""
+    """LoopError where a controller of ``own`` cannot take over in a loop that reads ``loop``; see ``adapted``."""
     differ = [*_basics(own, loop), *_steered(own, loop), *_measured(own, loop)]
     if differ:
         plants = f"the new controller (made for {own.case}) does not fit this loop (made for {loop.case})"
@@ -244,7 +248,7 @@ class InCharge:
         """Try ``controller``, in a loop that reads the signals of ``loop``; see ``ControlLoop.swap``."""
         if trial < 1:
             raise LoopError(f"trial is {trial}; a controller is tried for at least one scan")
-        new = fitted(controller, loop)
+        new = adapted(controller, loop)
         self.successor = Successor(new, trial, () if self._made is None else tuple(self._made(new.manifest)))
 
     def forget(self, reason: str) -> None:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.historian.cleaning.grid import Grid
+from loopwright.pipeline.historian.cleaning.row_grid import Grid
 from loopwright.pipeline.historian.cleaning.tags import Tag, automatic, by_hand
 from loopwright.pipeline.historian.guessing import loop_in
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.old_loops import OldController, Operated, operation
-from loopwright.pipeline.records.record_file import SetPoints
+from loopwright.pipeline.records.record_file import RecordedSetPoints
 
 
 # ------------------------------------------ set point, PV, mode and MV of a loop, and the rows in which it was at work
@@ -58,7 +58,7 @@ def loops(
 
 def set_points(
     grid: Grid, code: NDArray[np.uint8], tags: Sequence[Tag], modes: Mapping[str, Sequence[str]], worked: Container[str]
-) -> SetPoints:
+) -> RecordedSetPoints:
     """The set points in the rows of the record, of loops whose mode is known or whose PV is among those ``worked`` on.
 
     Nobody knows of the others whether their set points were followed.
@@ -66,7 +66,7 @@ def set_points(
     known = [loop for loop in loops(grid, code, tags, modes) if loop.automatic or loop.pv.name in worked]
     columns = [np.where(loop.rows, grid.value[loop.sp.tag], np.nan)[code == 0] for loop in known]
     values = np.column_stack(columns) if columns else np.empty((int(np.count_nonzero(code == 0)), 0))
-    return SetPoints(tuple(loop.pv.name for loop in known), values.astype(np.float64))
+    return RecordedSetPoints(tuple(loop.pv.name for loop in known), values.astype(np.float64))
 
 
 def _partner(sp: Tag, tags: Sequence[Tag], place: int) -> Tag | None:
@@ -141,7 +141,7 @@ PV; with a derivative, or P on a share of the set point; with both."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Windows:
+class LoopWindows:
     """Windows of equal length, in which a loop was at work and its MV moved away from its limits.
 
     Summed over a window the velocity form says: the MV is the law's parts and a level that nobody knows, so that the
@@ -156,14 +156,14 @@ class Windows:
         """Whether each third of them can tell."""
         return len(self.moved) >= LEAST_WINDOWS
 
-    def taken(self, use: int) -> Windows:
+    def taken(self, use: int) -> LoopWindows:
         """Every third window."""
-        return Windows(self.moved[use::3], self.parts[use::3])
+        return LoopWindows(self.moved[use::3], self.parts[use::3])
 
-    def asked(self) -> Windows:
+    def asked(self) -> LoopWindows:
         """Windows in which the set point moves: they alone tell how the law answers to it."""
         moves = np.abs(self.parts[..., 1]).max(axis=1) > 0
-        return Windows(self.moved[moves], self.parts[moves])
+        return LoopWindows(self.moved[moves], self.parts[moves])
 
     def errors(self, numbers: Array) -> Array:
         """Sum of squared errors of the law with ``numbers`` (4,) in each window (W,)."""
@@ -200,17 +200,17 @@ class Windows:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fitted:
+class FittedForm:
     """One form of the law fitted on some windows, and what it leaves of others."""
 
-    windows: Windows
+    windows: LoopWindows
     basis: tuple[Array, ...]
     late: int
     numbers: Array
     unexplained: float  # of the windows for the choice, or of those in which the set point moves where that is more
 
     @classmethod
-    def of(cls, windows: Windows, basis: tuple[Array, ...], late: int) -> Fitted:
+    def of(cls, windows: LoopWindows, basis: tuple[Array, ...], late: int) -> FittedForm:
         """Fitted on its third of the windows."""
         numbers, asked = windows.taken(FIT).fitted(basis), windows.asked()
         unexplained = windows.taken(CHOICE).unexplained(numbers)
@@ -223,7 +223,7 @@ class Fitted:
         """Share explained of the windows that had no part in fit and choice."""
         return 1 - self.windows.taken(SCORE).unexplained(self.numbers)
 
-    def betters(self, other: Fitted | None) -> bool:
+    def betters(self, other: FittedForm | None) -> bool:
         """Whether it leaves by far less than a plainer one; one that is not sound betters none."""
         return other is None or (self.sound and self.unexplained < BETTER * other.unexplained)
 
@@ -265,12 +265,12 @@ def identified(grid: Grid, loop: LoopRows, mv: Tag) -> OldController:
     piece = loop.piece if loop.automatic else _without_rests(rows[-1], loop.piece)
     if loop.manual:
         return _unknown(loop, mv, "the loop was in manual in all rows")
-    best: Fitted | None = None
+    best: FittedForm | None = None
     for length in WINDOWS:
         late = [(n, w) for n in LATE if (w := _windows(rows, piece, grid.period_s, length, n, mv)).enough]
-        own: Fitted | None = None
+        own: FittedForm | None = None
         for forms in FORMS if late else ():
-            one = min((Fitted.of(w, form, n) for form in forms for n, w in late), key=lambda f: f.unexplained)
+            one = min((FittedForm.of(w, form, n) for form in forms for n, w in late), key=lambda f: f.unexplained)
             own = one if one.betters(own) else own
         best = own if own is not None and own.betters(best) else best
     return _law(best, loop, mv)
@@ -281,7 +281,7 @@ def _unknown(loop: LoopRows, mv: Tag, why: str) -> OldController:
     return OldController(*signals, 0.0, 0.0, 0.0, 0.0, 0, 0, 0, 0.0, loop.same_name, why)
 
 
-def _law(found: Fitted | None, loop: LoopRows, mv: Tag) -> OldController:
+def _law(found: FittedForm | None, loop: LoopRows, mv: Tag) -> OldController:
     if found is None:
         few = f"{np.count_nonzero(loop.rows)} rows are too few in which the loop is at work and the MV moves"
         return _unknown(loop, mv, few)
@@ -302,7 +302,7 @@ def _law(found: Fitted | None, loop: LoopRows, mv: Tag) -> OldController:
     )
 
 
-def _doubt(found: Fitted) -> str:
+def _doubt(found: FittedForm) -> str:
     """Why the law is not believed, a clause; empty where it is."""
     if found.share < BELIEVED:
         return "set point and PV do not explain the MV: hand operation, a cascade or another law"
@@ -321,7 +321,7 @@ def _without_rests(op: Array, piece: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def _windows(
     rows: Sequence[Array], piece: NDArray[np.int64], period_s: float, length: int, late: int, mv: Tag
-) -> Windows:
+) -> LoopWindows:
     """The windows of rows (n,) of set point, PV and MV, the PV ``late`` rows before the others."""
     sp, pv, op = rows
     begins = np.flatnonzero(np.r_[True, np.diff(piece) != 0])
@@ -339,4 +339,4 @@ def _windows(
     e = r - y
     parts = [-y, r, period_s * np.cumsum(e, axis=1), (pv[at - late - 1] - y) / period_s]
     moved, stacked = op[at], np.stack(parts, axis=-1)
-    return Windows(moved - moved.mean(axis=1, keepdims=True), stacked - stacked.mean(axis=1, keepdims=True))
+    return LoopWindows(moved - moved.mean(axis=1, keepdims=True), stacked - stacked.mean(axis=1, keepdims=True))

@@ -25,7 +25,7 @@ from loopwright.serving import (
     Signal,
     default_guards,
 )
-from loopwright.serving.active_controller import Fitted, fitted
+from loopwright.serving.in_charge import AdaptedController, adapted
 from loopwright.serving.journal import columns
 from loopwright.serving.trust import signer
 
@@ -73,7 +73,7 @@ def test_it_gets_its_own_signals_by_name(made: Made) -> None:
         ((LEVEL, P), (HEAT, *SIGNALS.dv), 50 + 2.0 + 2.0 + 5.0),
     ):
         own = made(afresh, replace(WIDE, pv=pv, dv=dv))
-        seat = fitted(own, loop)
+        seat = adapted(own, loop)
         step = seat.step(sp=1.0, pv=sample().pv, dv=sample().dv, mv_applied=40.0, state=seat.cold_state())
         assert step.mv.tolist() == pytest.approx([expected])
         seat.warm()
@@ -85,16 +85,16 @@ def test_its_manifest_has_the_signals_of_the_loop_and_its_own_ranges(made: Made)
     loop = made(afresh, WIDE)
     narrow = replace(LEVEL, high=1.5)
     own = made(deaf, replace(WIDE, pv=(narrow,), dv=()))
-    seat = fitted(own, loop.manifest)
-    assert isinstance(seat, Fitted)
+    seat = adapted(own, loop.manifest)
+    assert isinstance(seat, AdaptedController)
     assert seat.manifest.pv == (narrow, T, P)
     assert seat.manifest.dv == WIDE.dv
     assert "dv" in seat.manifest.inputs  # the loop judged it, and goes on doing so
     assert (seat.sha256, seat.path, seat.size_bytes) == (own.sha256, own.path, own.size_bytes)
     assert signer(seat) is None
     assert columns(seat.manifest)[: 1 + 3] == ["sp level", "pv level", "pv T", "pv P"]
-    assert fitted(loop, loop.manifest) is loop
-    assert fitted(seat, loop.manifest) is seat  # once replaced, it may be put back
+    assert adapted(loop, loop.manifest) is loop
+    assert adapted(seat, loop.manifest) is seat  # once replaced, it may be put back
 
 
 def test_it_takes_over_and_the_old_one_is_put_back(made: Made) -> None:
@@ -222,6 +222,6 @@ def test_it_goes_into_its_part_of_the_range_by_its_largest_move_a_period(made: M
     for mv, expected in ((47.0, 52.0), (52.0, 57.0), (57.0, 60.0), (62.0, 60.0), (60.0, 60.0)):
         assert scan(mv) == pytest.approx(expected)
     # A read-back beyond the actuator's range counts as its end.
-    seat, one = fitted(part, old.manifest), sample()
+    seat, one = adapted(part, old.manifest), sample()
     step = seat.step(sp=1.0, pv=one.pv[:2], dv=one.dv[:1], mv_applied=-3.0, state=seat.cold_state())
     assert step.mv.tolist() == pytest.approx([5.0])

@@ -75,7 +75,7 @@ MOVE_WEIGHT = {False: 1e-3, True: 1e-6}
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class NmpcPlan:
     """A solution: the moves, the states that they lead to, and what a next solve starts from."""
 
     mv: Array  # (n, n_mv)
@@ -197,7 +197,7 @@ class Horizon:
         pv = self.plant.measurement(self._x_low + self._x_span * x)
         return ca.Function("controlled", [x], [pv[: self._n_cv] / self._cv_span])
 
-    def solve(self, x0: Array, sp: Array, p: Array, start: Plan) -> Plan:
+    def solve(self, x0: Array, sp: Array, p: Array, start: NmpcPlan) -> NmpcPlan:
         """The plan from state ``x0``, begun from ``start``.
 
         ``x0`` (n_x,); set points ``sp`` (n, n_sp) at samples 1..n; plant parameters ``p`` (n, n_p)
@@ -227,14 +227,14 @@ class Horizon:
         values: Array,
         solved: bool = False,
         multipliers: tuple[Array, Array] | None = None,
-    ) -> Plan:
+    ) -> NmpcPlan:
         n_z = self._n_x * self._points
         x = np.vstack([x0, self._x_low + self._x_span * values[n_z - self._n_x : n_z].T])
         mv = self._mv_low + self._mv_span * np.clip(values[n_z : n_z + self._n_mv].T, 0.0, 1.0)
         cv = self.plant.measured(x[1:])[:, : self._n_cv]
         error = np.abs(sp - cv) / self._cv_span
         cost = float(np.sum(error**2 if self._squared else error))
-        return Plan(mv, x, cost, solved and bool(np.all(np.isfinite(x))), values, multipliers)
+        return NmpcPlan(mv, x, cost, solved and bool(np.all(np.isfinite(x))), values, multipliers)
 
     def _kept(self, x: Array, fraction: float, mv: Array, p: Array, step: Callable[..., Array]) -> float:
         """The fraction of the first MV's range nearest to ``fraction`` that keeps the limits over a period.
@@ -251,15 +251,15 @@ class Horizon:
         end = None if keeps(fraction) else next((end for end in (1.0, 0.0) if keeps(end)), None)
         return fraction if end is None else _halved(end, fraction, keeps)[0]
 
-    def shifted(self, plan: Plan) -> Plan:
+    def shifted(self, plan: NmpcPlan) -> NmpcPlan:
         """The rest of a plan, its last period repeated: where the next sample's solve starts."""
         mv, x = (np.vstack([rows[1:], rows[-1:]]) for rows in (plan.mv, plan.x))
         values = np.hstack([plan.values[:, 1:], plan.values[:, -1:]])
-        return Plan(mv, x, plan.cost, plan.solved, values, plan.multipliers)
+        return NmpcPlan(mv, x, plan.cost, plan.solved, values, plan.multipliers)
 
     def rollout(
         self, x0: Array, sp: Array, p: Array, reach: int, step: Callable[..., Array], moves: Array | None = None
-    ) -> Plan:
+    ) -> NmpcPlan:
         """A start for ``solve``: the exact inverse over ``reach`` periods, simulated by ``step``.
 
         ``moves`` (m, n_mv) are taken over the first m periods in place of the inverse's.

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.cleaning.sampling import Sampling, exact_step, row_numbers, sampling, whole_multiple
+from loopwright.pipeline.historian.cleaning.sampling import (
+    TagSampling,
+    exact_step,
+    row_numbers,
+    sampling,
+    whole_multiple,
+)
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.files.numbers import Codes
 from loopwright.pipeline.historian.files.quality import Reason
@@ -61,7 +67,7 @@ def resampled(
     done: Callable[[str], None] = lambda _: None,
     *,
     sampled: bool = False,
-) -> tuple[Grid, tuple[Sampling, ...]]:
+) -> tuple[Grid, tuple[TagSampling, ...]]:
     """All series on one grid: PVs and measured disturbances (``pv``) drawn or averaged, the others held.
 
     Grid: pieces of the PVs' time without a gap longer than their hold. Where the PVs' stamps keep time and the period

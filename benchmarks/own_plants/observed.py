@@ -1,0 +1,130 @@
+"""What a controller could reach that knows the equations and measures what ours does: the NMPC behind a Kalman filter.
+
+The NMPC of ``bound_of`` is told the state and what moves by itself, and has no noise. This one has an extended Kalman
+filter over the true equations: z = [x, q], q the unmeasured loads and what else moves,
+
+    q(k+1) = m + a (q(k) - m) + w(k).
+
+It starts from the true state, and knows a, m and the size of w of what wanders. How fast loads at the MVs may move is
+no fact of the plant: a filter that follows them fast lets more noise through, so that there is a row for each pace.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from closed_plant import ClosedPlant
+from loops import LoopTest, Score, scores, tests_of
+from plant import OwnPlant
+
+from loopwright.pipeline.evaluation.case import Effort
+from loopwright.pipeline.optimal.perfect import PerfectNmpc
+from loopwright.pipeline.plants.simulator import Array
+
+PACES = (0.03, 0.1, 0.3, 1.0)  # of loads at the MVs [% of the valve a sample], or times what wanders really does
+DRIFT_SEEN = 5_000  # samples of a drift from which the size of its steps is known
+SMALL = 1e-9  # of a state's variance: the equations are exact
+
+
+@dataclass(frozen=True, slots=True)
+class Moving:
+    """A parameter that nobody measures: where it goes by itself, how much is left after a sample, its pushes' sd."""
+
+    name: str
+    mean: float
+    kept: float
+    sd: float
+
+
+def moving_of(plant: OwnPlant, pace: float) -> list[Moving]:
+    """Of a closed plant its wandering loads; of others a load at each MV, and what drifts."""
+    if isinstance(plant, ClosedPlant):
+        return [
+            Moving(w.parameter, getattr(plant, w.parameter), kept, pace * w.sd * float(np.sqrt(1 - kept**2)))
+            for w in plant.wanders
+            if (kept := float(np.exp(-1 / w.samples)))
+        ]
+    loads = [Moving(name, 0.0, 1.0, pace) for name in plant.load_names()]
+    courses = plant.drift(DRIFT_SEEN, np.random.default_rng(0))
+    return loads + [Moving(n, 0.0, 1.0, float(np.sqrt(np.mean(np.diff(c) ** 2)))) for n, c in courses.items()]
+
+
+class Observer:
+    """An extended Kalman filter of the states and of the parameters that move, from the truth at the start."""
+
+    def __init__(self, plant: OwnPlant, moving: list[Moving], x: Array, parameters: Array) -> None:
+        self.plant, self.moving = plant, moving
+        self.at = [plant.parameter_names().index(m.name) for m in moving]
+        self.z = np.concatenate([x, parameters[self.at]])
+        self.cov = SMALL * np.eye(len(self.z))
+        self.pushes = np.concatenate([np.full(len(x), SMALL), [m.sd**2 for m in moving]])
+        names = [
+            ca.SX.sym(name, n) for name, n in (("x", len(x)), ("u", len(plant.mv_signals)), ("p", len(parameters)))
+        ]
+        after = plant.transition(names[0], names[1], ca.DM.zeros(0, 1), names[2])
+        ways = [after, ca.jacobian(after, names[0]), ca.jacobian(after, names[2])]
+        self.advance = ca.Function("advance", names, [ca.densify(way) for way in ways])
+        seen = plant.measurement(names[0])
+        self.look = ca.Function("look", names[:1], [seen, ca.densify(ca.jacobian(seen, names[0]))])
+
+    def told(self, parameters: Array) -> Array:
+        """The parameters (n_p,) with those that move as the filter has them."""
+        filled = np.array(parameters)
+        filled[self.at] = self.z[len(self.z) - len(self.at) :]
+        return filled
+
+    def see(self, pv: Array) -> None:
+        """Correct by a measurement (n_pv,)."""
+        n = len(self.z) - len(self.at)
+        seen, by_state = (np.array(v) for v in self.look(self.z[:n]))
+        by = np.hstack([by_state, np.zeros((len(pv), len(self.at)))])
+        spread = by @ self.cov @ by.T + np.diag(self.plant.noise_std**2)
+        gain = np.linalg.solve(spread, by @ self.cov).T
+        self.z = self.z + gain @ (pv - seen[:, 0])
+        self.cov = self.cov - gain @ spread @ gain.T
+
+    def go_on(self, mv: Array, parameters: Array) -> None:
+        """To the next sample, under MVs (n_mv,)."""
+        n = len(self.z) - len(self.at)
+        after, by_state, by_parameter = (np.array(v) for v in self.advance(self.z[:n], mv, self.told(parameters)))
+        kept, mean = (np.array([getattr(m, of) for m in self.moving]) for of in ("kept", "mean"))
+        by = np.block([[by_state, by_parameter[:, self.at]], [np.zeros((len(kept), n)), np.diag(kept)]])
+        self.z = np.concatenate([after[:, 0], mean + kept * (self.z[n:] - mean)])
+        self.cov = by @ self.cov @ by.T + np.diag(self.pushes)
+
+
+def observed(plant: OwnPlant, tests: list[LoopTest], pace: float) -> Score:
+    """The scores of the NMPC behind the filter, with the noise that ``loops.closed`` gives a law."""
+    nmpc = PerfectNmpc(plant, effort=Effort(periods=max(40, plant.hold // 2), elements=1, every=1))
+    ys, us = [], []
+    for test in tests:
+        scenario, nominal = test.scenario, plant.parameters()
+        true, shown = scenario.parameters(plant), plant.known(scenario)
+        noise = np.random.default_rng((scenario.seed or 0) + 1).standard_normal((scenario.samples, len(plant.noise)))
+        measured = [m.parameter for m in plant.measured_disturbances] if isinstance(plant, ClosedPlant) else []
+        given = np.tile(nominal, (scenario.samples, 1))
+        given[:, [plant.parameter_names().index(name) for name in measured]] = shown
+        nmpc.reset()
+        x, filtered = scenario.x0, Observer(plant, moving_of(plant, pace), scenario.x0, true[0])
+        y, u = [], []
+        for k in range(scenario.samples):
+            y.append(plant.measure(x) + test.upset[k])
+            filtered.see(y[-1] + noise[k] * plant.noise_std)
+            u.append(nmpc.step(filtered.z[: len(x)], scenario.sp[k], filtered.told(given[k])))
+            filtered.go_on(u[-1], given[k])
+            x = plant.step(x, u[-1], plant.dv_nominal, true[k])
+        ys.append(y)
+        us.append(u)
+    return scores(plant, tests, np.array(ys), np.array(us))
+
+
+def observed_row(plant: OwnPlant, sequences: int) -> str:
+    """A row of text: errors on set points and on loads of each pace, of so many tests."""
+    tests = tests_of(plant)
+    cells = []
+    for pace in PACES:
+        found = [observed(plant, tests[name][:sequences], pace).nmae for name in ("set points", "loads")]
+        cells.append("{:5.2f} {:5.2f}".format(*found))
+    return f"{plant.name:12} " + " | ".join(cells)
