@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -81,7 +82,8 @@ class Cycle:
 class LawMetrics:
     """metrics.json of one law, ``controllers.<case>-<name>``; this class alone writes and reads it.
 
-    ``development``: data seed -> error over the development sequences (``Case.developed``);
+    ``development``: data seed -> error over the development sequences (``Case.developed``), ``development_travel`` [MV]
+    what the MVs travelled there, the mean of a sequence;
     ``locked_up``: test -> data seed -> closed loops that got stuck, of those where any did; ``as_printed``: a
     reproduction of a paper's law; ``sequences``: test -> seed of a sequence -> medians over the data seeds;
     ``forms``: the shipped one, BASE, and the variants by their names in params.yaml; ``reached``: PV or MV -> its
@@ -102,6 +104,7 @@ class LawMetrics:
     lock_ups: int = 0
     development_lock_ups: int = 0
     development: Mapping[str, float] = field(default_factory=dict)
+    development_travel: Mapping[str, float] = field(default_factory=dict)
     locked_up: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     as_printed: bool = False
     sequences: Mapping[str, Mapping[str, Row]] = field(default_factory=dict)
@@ -178,6 +181,11 @@ class LawEvidence:
         """
         errors = self.metrics.development.values()
         return None if not errors or self.metrics.development_lock_ups else statistics.median(errors)
+
+    @property
+    def development_travel(self) -> float:
+        """Median of the data seeds' travel of the MVs over the development sequences; infinite if not known."""
+        return statistics.median(self.metrics.development_travel.values() or (math.inf,))
 
     def form_of(self, setting: Mapping[str, Any]) -> str | None:
         """Name of the form whose numbers, words and switches are the shipped ones but for ``setting``; BASE first."""

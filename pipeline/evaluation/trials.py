@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import statistics
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -88,6 +90,7 @@ class Trial:
     metrics: dict[str, Metrics]
     sequences: dict[str, dict[str, Metrics]]  # of the tests with several sequences, by their seeds
     development: float  # the case's metric over the development sequences, see ``Case.developed``
+    development_travel: float  # of the MVs over these, their mean; nan without any
     locked_up: dict[str, int]  # test -> closed loops that locked up, of those where any did; DEVELOPED: development
     swings: dict[str, int]  # the same of closed loops that swing to the end
     beyond_reach: dict[str, int]  # test -> holds that count as no lock-up, because no control gets to the set point
@@ -326,7 +329,7 @@ class Trials:
             if len(rows) > 1 and not piece.noise:
                 tests = self.sequences[piece.kind][piece.test]
                 sequences[piece.test] = {str(t.seed): row for t, row in zip(tests, rows, strict=True)}
-        developed = [r.metrics[self.case.metric] for p, r in found.items() if p.kind == DEVELOPED]
+        developed = [r.metrics for p, r in found.items() if p.kind == DEVELOPED]
         first, ran = next(iter(found.items()))
         # Of each test the worst comes last; of all, on plants gone wrong where there is no other.
         cycles = sorted(
@@ -339,7 +342,8 @@ class Trials:
             ran.info,
             metrics,
             sequences,
-            self.case.developed(developed),
+            self.case.developed([row[self.case.metric] for row in developed]),
+            statistics.fmean(row["mv_travel"] for row in developed) if developed else math.nan,
             {name: count for name, count in locked_up.items() if count},
             {name: count for name, count in swings.items() if count},
             {name: count for name, count in beyond.items() if count},

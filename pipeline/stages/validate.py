@@ -211,6 +211,7 @@ def _metrics(
         lock_ups=sum(t.lock_ups for t in base),
         development_lock_ups=sum(t.development_lock_ups for t in base),
         development={str(t.seed): t.development for t in base},
+        development_travel={str(t.seed): t.development_travel for t in base},
         locked_up=_of_tests(base, "locked_up"),
         as_printed=params.as_printed,
         sequences={

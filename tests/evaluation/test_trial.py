@@ -124,6 +124,7 @@ def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: p
     variant = try_files(case, 0, [("gain=1", 3, Path("p.onnx"))], "try")[0]
     assert list(variant.metrics) == fixed  # with noise, because the plant has no other measurements
     assert np.isnan(variant.development)
+    assert np.isnan(variant.development_travel)
     assert base.locked_up == {}
     assert base.lock_ups == base.development_lock_ups == 0
     # The development is judged by the case's metric, under the noise that the plant always has.
@@ -131,6 +132,7 @@ def test_a_trial_runs_what_the_case_asks_of_each_form(case: Case, monkeypatch: p
     tests = case.development()
     rows = [repeated(controller, case, t, True, trials.DEVELOPMENT + i) for i, t in enumerate(tests)]
     assert base.development == pytest.approx(np.mean([row.metrics["sse"] for row in rows]))
+    assert base.development_travel == pytest.approx(np.mean([row.metrics["mv_travel"] for row in rows]))
     # Infos are those of the manifest, without the mark of a refused step.
     assert base.info == ("error", "steps")
     assert base.curves["trajectory"].info.shape == (50, 2)

@@ -29,13 +29,16 @@ NOISE = 0.01
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")
 
 
-def law(name: str, development: float, lock_ups: int = 0, top: float = 2.5, **mae: float) -> LawEvidence:
+def law(
+    name: str, development: float, lock_ups: int = 0, top: float = 2.5, travel: float = 1.0, **mae: float
+) -> LawEvidence:
     """Evidence with these errors by test; a test ends with a tenth of its error."""
     rows = {test: {"mae": mae.get(test, 0.1), "max_asse": mae.get(test, 0.1) / 10} for test in TESTS}
     form = Form({}, (), {test: OverSeeds(row, row, row, {"0": row}) for test, row in rows.items()})
     return LawEvidence(
         LawMetrics(
             name, name, "mae", (0,), 0, {BASE: form}, lock_ups=lock_ups, development={"0": development},
+            development_travel={"0": travel},
             locked_up={"spoilt": {"0": lock_ups}} if lock_ups else {}, reached={"y0": (-2.0, top)},
         ),
         Path(),
@@ -171,6 +174,13 @@ def test_a_law_is_best_only_where_it_beats_the_old_loop() -> None:
     assert worse.best is None
     stuck = beside_the_old_loop(law("predictive", 1.2), law("old_loop", 1.1, lock_ups=1))
     assert stuck.best == "predictive"  # nobody keeps a loop that gets stuck
+
+
+def test_of_laws_with_about_the_same_error_the_calmest_is_best() -> None:
+    """A last bit of rounding must not decide: errors of a per cent more are the same error."""
+    assert evidence(law("predictive", 1.009, travel=1.0), law("pid", 1.0, travel=3.0)).best == "predictive"
+    assert evidence(law("predictive", 1.011, travel=1.0), law("pid", 1.0, travel=3.0)).best == "pid"
+    assert evidence(law("predictive", 1.009, travel=3.0), law("pid", 1.0, travel=1.0)).best == "pid"
 
 
 @pytest.mark.usefixtures("run_before")
