@@ -332,9 +332,7 @@ class Evidence:
         others = ", ".join(f"{n} {e:.3g}" for n, e in errors.items() if n != self.best)
         beside = f" (others: {others})" if others else ""
         lowest = errors[self.best] <= min(self._candidates.values())
-        place = (
-            "is the lowest" if lowest else f"is within {ALIKE - 1:.0%} of the lowest, and its MVs travel least"
-        )
+        place = "is the lowest" if lowest else f"is within {ALIKE - 1:.0%} of the lowest, and its MVs travel least"
         return f"{self._development}, which are not scored, {place}: " + (
             f"{errors[self.best]:.4g} {self.case.unit}".rstrip() + beside
         )
