@@ -10,12 +10,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loopwright.serving.active_controller import ActiveController, Guards, Successor
 from loopwright.serving.clock import Clock, MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Guard, Sample, default_guards, reworded
-from loopwright.serving.in_charge import Guards, InCharge, Successor
 from loopwright.serving.modes import ByHand, Command, Fallback, LoopMode, Mode, Transfer, mode_of
 from loopwright.serving.mv_readback import AppliedMV
 from loopwright.serving.ranges import within
@@ -106,7 +106,7 @@ class ControlLoop:
         if not 0 <= transfer_s < inf:
             raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         manifest = controller.manifest
-        self._charge = InCharge(controller, default_guards if guards is None else guards)
+        self._charge = ActiveController(controller, default_guards if guards is None else guards)
         self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
         self.endpoint = endpoint
         self.recover_after = recover_after

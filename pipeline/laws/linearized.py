@@ -21,21 +21,10 @@ from loopwright.pipeline.models.memory import Memory, Named, Slot
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 
 
-@dataclass(frozen=True, slots=True)
-class NnarxParams(AdaptiveParams):
-    """Parameters of an adaptive PID, and how much the model believes the measurement.
-
-    ``offset_filter`` alpha and ``trust``, both in (0, 1], as in ``NextOutput``; 1 is as the paper.
-    """
-
-    offset_filter: float = 1.0
-    trust: float = 1.0
-
-    def __post_init__(self) -> None:
-        AdaptiveParams.__post_init__(self)
-        for name in ("offset_filter", "trust"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must lie in (0, 1], 1 to believe every sample")
+def require_share(name: str, value: float) -> None:
+    """ValueError unless a parameter of ``NextOutput`` lies in (0, 1]."""
+    if not 0 < value <= 1:
+        raise ValueError(f"{name} is {value}; it must lie in (0, 1], 1 to believe every sample")
 
 
 def central_model(model: NNARX) -> Arx:
@@ -52,16 +41,20 @@ def next_output(law: str, model: NNARX, unit: float, offset_filter: float, trust
 
 
 class NnarxPid(AdaptivePid):
-    """A PID law over part ``nnarx``. ``more`` are slots of the law's own, ``info`` the names of its own info."""
+    """A PID law over part ``nnarx``.
+
+    ``params`` are those of an adaptive PID with ``offset_filter`` and ``trust``; ``more`` slots of the law's own,
+    ``info`` the names of its own info.
+    """
 
     parts: ClassVar[Mapping[str, str]] = {"nnarx": "kind nnarx"}
-    params: NnarxParams
+    params: AdaptiveParams
 
     def __init__(
         self,
         signals: Signals,
         model: NNARX,
-        params: NnarxParams,
+        params: Any,
         more: Mapping[str, Slot] | None = None,
         info: tuple[str, ...] = (),
     ) -> None:
@@ -109,14 +102,17 @@ class LinearizedPid(NnarxPid):
     title: ClassVar[str] = "PID from the linearized NNARX"
 
     @dataclass(frozen=True, slots=True)
-    class Params(NnarxParams):
-        """Parameters of NnarxParams, and the penalty that ``adaptive`` puts in the place of ``penalty``.
+    class Params(AdaptiveParams):
+        """Parameters of AdaptiveParams, and the penalty that ``adaptive`` puts in the place of ``penalty``.
 
+        ``offset_filter`` alpha and ``trust``, both in (0, 1], as in ``NextOutput``; 1 is as the paper.
         ``penalty_start`` and ``penalty_low`` [pv^2]: its first and its least value, None as ``penalty``;
         ``eps_high`` and ``eps_low`` [pv]: linearization errors above which it doubles and below which it
         halves; ``adaptive`` needs an ``eps_high`` above 0.
         """
 
+        offset_filter: float = 1.0
+        trust: float = 1.0
         adaptive: bool = False
         penalty_start: float | None = None
         penalty_low: float | None = None
@@ -124,7 +120,9 @@ class LinearizedPid(NnarxPid):
         eps_low: float = 0.0
 
         def __post_init__(self) -> None:
-            NnarxParams.__post_init__(self)
+            AdaptiveParams.__post_init__(self)
+            require_share("offset_filter", self.offset_filter)
+            require_share("trust", self.trust)
             start, low = self.penalties
             if not (low > 0 and (low == start or ascend(low, start))):
                 raise ValueError(f"penalty_low is {low} and penalty_start {start}; give 0 < low <= start")
@@ -230,13 +228,20 @@ class GaussNewtonPid(NnarxPid):
     title: ClassVar[str] = "PID from the NNARX, relinearized within the sample"
 
     @dataclass(frozen=True, slots=True)
-    class Params(NnarxParams):
-        """Parameters of NnarxParams; ``relinearize`` is the number of linearizations, 1 or more."""
+    class Params(AdaptiveParams):
+        """Parameters of AdaptiveParams; ``relinearize`` is the number of linearizations, 1 or more.
 
+        ``offset_filter`` alpha and ``trust``, both in (0, 1], as in ``NextOutput``; 1 is as the paper.
+        """
+
+        offset_filter: float = 1.0
+        trust: float = 1.0
         relinearize: int = 5
 
         def __post_init__(self) -> None:
-            NnarxParams.__post_init__(self)
+            AdaptiveParams.__post_init__(self)
+            require_share("offset_filter", self.offset_filter)
+            require_share("trust", self.trust)
             if self.relinearize < 1:
                 raise ValueError(f"relinearize is {self.relinearize}; give 1 or more linearizations a sample")
 

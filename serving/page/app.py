@@ -20,10 +20,10 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from loopwright.serving.active_controller import require_fits
 from loopwright.serving.controller_file import file_digest, unseal
 from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
 from loopwright.serving.graph.audit import MAX_BYTES, audit
-from loopwright.serving.in_charge import require_fits
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 from loopwright.serving.page.access import LONGEST_BODY, Access

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, TypeAlias
 
+from loopwright.serving.active_controller import require_fits
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import nearest
-from loopwright.serving.in_charge import require_fits
 from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import ControlLoop, Mode, within
 from loopwright.serving.manifest import Signal

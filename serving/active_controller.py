@@ -196,7 +196,7 @@ class Successor:
 Guards: TypeAlias = Sequence[Guard] | Callable[[Manifest], Sequence[Guard]]
 
 
-class InCharge:
+class ActiveController:
     """The controller in charge with the state of its law, its guards and the samples that they look back to.
 
     ``guards`` are a host's own, or what makes them for a controller's manifest: they are then made anew for each
