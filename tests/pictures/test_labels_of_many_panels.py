@@ -23,7 +23,7 @@ from loopwright.pipeline.pictures.identified_pictures import (
     gains_picture,
     step_responses_picture,
 )
-from loopwright.pipeline.pictures.loop_pictures import LoopPanels
+from loopwright.pipeline.pictures.loop_panels import LoopPanels
 
 GAINS = np.array([[2.0, -0.8, 0.3, 0.01], [0.6, 1.5, -0.2, -0.03]])
 N_Y, N_MV, N_DV = 2, 3, 1

@@ -21,7 +21,8 @@ from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.pictures import loop_picture
 from loopwright.pipeline.pictures.drawing import STYLE, clear_legend, layer, legend_below, scale
-from loopwright.pipeline.pictures.loop_pictures import LoopPanels, info_label, rings, too_fast
+from loopwright.pipeline.pictures.loop_panels import LoopPanels, rings, too_fast
+from loopwright.pipeline.pictures.loop_pictures import info_label
 from loopwright.pipeline.pictures.model_pictures import candidates_picture
 from loopwright.pipeline.report import figures
 from loopwright.serving.manifest import Signal
