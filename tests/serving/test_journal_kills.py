@@ -29,7 +29,7 @@ import os, signal, sys, time
 from pathlib import Path
 from loopwright.serving import Manifest
 from loopwright.serving.journal import writer
-from loopwright.serving.journal import Event, Journal, Scan, writer
+from loopwright.serving.journal import EventEntry, Journal, ScanEntry, writer
 path, manifest, small = Path(sys.argv[1]), Manifest.from_json(sys.argv[2]), sys.argv[3] == "small"
 if small:
     writer.BLOCK, writer.FRESH, writer.FLUSH_S, writer.LEAST_EVENTS = 20, 40, 0.02, 60
@@ -43,11 +43,11 @@ def write(statement, nth):
             os.kill(os.getpid(), signal.SIGKILL)
     journal._base.set_trace_callback(trace)
     journal.begin(manifest, "", time.time())
-    journal.event(Event(time.time(), "fault", "loop", "the level is high", alarm="level", raised=True))
+    journal.event(EventEntry(time.time(), "fault", "loop", "the level is high", alarm="level", raised=True))
     for k in range(20_000):
-        journal.scan(Scan(time.time(), "AUTO", (float(k),) * 9))
+        journal.scan(ScanEntry(time.time(), "AUTO", (float(k),) * 9))
         if small:
-            journal.event(Event(time.time(), "change", "anna", f"set point {k}"))
+            journal.event(EventEntry(time.time(), "change", "anna", f"set point {k}"))
         os.write(1, b"%f\\n" % time.time())
         time.sleep(0.001)
 
