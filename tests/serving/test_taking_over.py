@@ -94,7 +94,7 @@ def test_a_shadow_that_does_not_know_where_the_mv_stands_moves_nothing(
 ) -> None:
     loop = make_loop(mode=Mode.SHADOW)
     loop.scan(sample(fault="PV level: Bad"))
-    with pytest.raises(LoopError, match=r"the last sample was refused \(PV level: Bad\), so where the MV stands"):
+    with pytest.raises(LoopError, match=r"the last sample was refused \(PV level: Bad\): where the MV stands"):
         loop.set_mode(mode)
     loop.miss("no answer")
     with pytest.raises(LoopError, match="no answer"):
