@@ -97,7 +97,7 @@ static int unpack(const void *bytes, size_t n, void **state) {
     return OK;
 }
 
-/* What the standard wants to be there, and this FMU does not offer. */
+/* A function that the standard wants to be there, and that this FMU does not offer. */
 #define NONE(name) EXPORT int name(void) { return ERROR; }
 
 /* ---------------------------------------------------------------- FMI 2.0 */

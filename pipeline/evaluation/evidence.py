@@ -259,8 +259,8 @@ class Evidence:
     def best(self) -> str | None:
         """The law with the lowest error on the development sequences; no scored test is used.
 
-        Errors up to ``ALIKE`` times the lowest do not say which law is better: data seeds differ by as much. Of such
-        laws the one whose MVs travel least there is the best. A law that locked up on one of them, or that is not
+        Errors up to ``ALIKE`` times the lowest do not say which law is better: data seeds differ by as much. The best
+        of such laws is the one whose MVs travel least there. A law that locked up on one of them, or that is not
         shipped, is left out. So is one that does not beat the loop that the plant was run by before, there, in each
         test and where the record is replayed: this much of a say the scored tests have. Without development figures the
         gate score decides.

@@ -60,7 +60,7 @@ def choice_words(
     errors = ", ".join(f"{other.error:.3g} % for {other.words(cvs, mvs)}" for other in others)
     weighted = ", times the periods since its set point moved," if chosen.time_weighted else ""
     return held, (
-        f"{rule}Of these, the {1 + len(others)} with relative gains nearest to 1 were tuned in closed loops, and the "
+        f"{rule}The {1 + len(others)} of these with relative gains nearest to 1 were tuned in closed loops, and the "
         f"smallest error decided, not the relative gains: {chosen.error:.3g} % for this pairing, {errors}. The error "
         f"is the mean over set points and loads of the development sequences{weighted} in % of each CV's range, added "
         "up; where there is noise, the price of MV travel is in it."

@@ -120,9 +120,9 @@ def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tu
         rows = [({"signal": s["name"], "unit": s["unit"]}, v) for s, v in zip(signals, values, strict=False)]
         yield name, "gauge", words, rows
     infos = zip(about["info"], state.get("info") or [], strict=False)
-    yield "info", "gauge", "What the law tells of itself.", [({"name": name}, v) for name, v in infos]
+    yield "info", "gauge", "Numbers that the law tells of itself.", [({"name": name}, v) for name, v in infos]
     numbers = state.get("numbers") or {}
-    yield "monitor", "gauge", "What the monitor has measured.", [({"name": n}, v) for n, v in numbers.items()]
+    yield "monitor", "gauge", "Numbers that the monitor has measured.", [({"name": n}, v) for n, v in numbers.items()]
     verdicts = state.get("verdicts") or []
     levels = [({"name": v["name"]}, LEVELS[v["level"]]) for v in verdicts if v["level"] in LEVELS]
     words = "Is the controller still right? 0 as validated, 1 watch, 2 retrain, -1 not known yet."

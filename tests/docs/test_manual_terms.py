@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from pages import DOCS, PAGES, ROOT, without_code
-from words_of_code import of_page, of_script, words_of
+from words_of_code import of_page, of_script, sources, words_of
 
 # What is written -> how it is spelled here. A word in backticks is a name, and stands as it is.
 WRONG = {
@@ -38,18 +38,6 @@ TITLES = {  # as the papers print them
 KEPT = {
     "pipeline/historian/guessing.py": {"setpoint"},  # what people write in their own files
 }
-
-
-FOREIGN = {"serving/page/static/uPlot.iife.min.js"}  # written by others
-
-
-def sources() -> list[Path]:
-    """Files of ours whose words people read, beside the manual; not what npm fetched."""
-    kinds = ("*.py", "*.c", "*.js", "*.mjs", "*.html", "*.html.j2")
-    folders = ("serving", "pipeline", "examples", "docs/_ext")
-    found = sorted({path for folder in folders for kind in kinds for path in (ROOT / folder).rglob(kind)})
-    ours = [path for path in found if "node_modules" not in path.parts and not path.is_symlink()]
-    return [path for path in ours if path.relative_to(ROOT).as_posix() not in FOREIGN]
 
 
 def misspelt(text: str) -> list[tuple[str, str]]:

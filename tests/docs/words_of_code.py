@@ -8,6 +8,9 @@ from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 
+from pages import ROOT
+
+FOREIGN = {"serving/page/static/uPlot.iife.min.js"}  # written by others
 SCRIPTS, MARKUP = {".c", ".js", ".mjs"}, {".html", ".j2"}
 SAID = {"alt", "aria-label", "content", "placeholder", "title"}  # attributes that a page shows or reads aloud
 # A slash after one of these signs begins a regular expression, and elsewhere it divides.
@@ -20,6 +23,15 @@ TOKEN = re.compile(
 )
 TEMPLATE = re.compile(r"(?P<end>`)|(?P<code>\$\{)|\\.|[^`$\\]+|\$", re.DOTALL)
 JINJA = re.compile(r"\{%.*?%\}|\{\{.*?\}\}|\{#.*?#\}", re.DOTALL)
+
+
+def sources() -> list[Path]:
+    """Files of ours whose words people read, beside the manual; not what npm fetched."""
+    kinds = ("*.py", "*.c", "*.js", "*.mjs", "*.html", "*.html.j2")
+    folders = ("serving", "pipeline", "examples", "docs/_ext")
+    found = sorted({path for folder in folders for kind in kinds for path in (ROOT / folder).rglob(kind)})
+    ours = [path for path in found if "node_modules" not in path.parts and not path.is_symlink()]
+    return [path for path in ours if path.relative_to(ROOT).as_posix() not in FOREIGN]
 
 
 def words_of(path: Path) -> list[tuple[int, str]]:

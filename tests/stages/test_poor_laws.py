@@ -78,7 +78,7 @@ def test_a_law_in_a_limit_cycle_on_a_model_as_it_is_is_not_shipped_and_its_loop_
     assert cycle.period_s == pytest.approx(2.0)  # the MV goes from one end to the other with each sample
     assert found.laws["hard"].withheld == own.poor
     page = (ARTIFACTS / "report.md").read_text()
-    assert "**What to do:**" not in page  # another law is shipped
+    assert "**To do:**" not in page  # another law is shipped
     assert "spoilt" in own.cycles  # where it swings farther, and any law may
     assert "in spoilt" not in own.poor
     assert "[Picture](figures/cycle_hard.png)" in page

@@ -1,1 +1,1 @@
-"""What the manual takes from the code, and how Sphinx shows it."""
+"""The parts of the manual that come from the code, and how Sphinx shows them."""

@@ -45,7 +45,7 @@ def _below(parser: argparse.ArgumentParser) -> Iterator[tuple[argparse.ArgumentP
 
 
 def arguments(parser: argparse.ArgumentParser) -> list[argparse.Action]:
-    """What the command takes, without ``--help`` and the list of its subcommands."""
+    """The arguments that the command takes, without ``--help`` and the list of its subcommands."""
     return [a for a in parser._actions if not isinstance(a, (argparse._HelpAction, Actions))]
 
 

@@ -1,4 +1,4 @@
-"""What the manual takes from the code: a name for each text that ``{generated}`` can ask for."""
+"""The parts of the manual that come from the code: a name for each text that ``{generated}`` can ask for."""
 
 from __future__ import annotations
 

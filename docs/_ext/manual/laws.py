@@ -54,7 +54,7 @@ def info_of(law: str) -> list[str]:
 
 
 def facts(name: str) -> str:
-    """What the class says of a law: needs, plants that it suits, parameters, info."""
+    """The facts that the class states of a law: needs, plants that it suits, parameters, info."""
     law = LAWS[name]
     rows = [
         ("name in params.yaml", code(name)),

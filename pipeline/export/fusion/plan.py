@@ -172,7 +172,7 @@ FIXED = {
     "Transpose": 240.0, "Tile": 300.0, "Expand": 300.0, "Identity": 100.0, "Neg": 160.0, "Relu": 170.0, "And": 145.0,
 }  # fmt: skip
 INPUT, OUTPUT = 90.0, 155.0  # of a Concat, of a Split
-# Of a product, of a multiply-add, of one in a large product; factor of many rows.
+# Price of a product, of a multiply-add, of one in a large product; factor of many rows.
 PRODUCT, MULTIPLY_ADD, LARGE, BATCHED = 415.0, 0.21, 0.35, 0.4
 LARGE_FROM = 4_000  # multiply-adds
 

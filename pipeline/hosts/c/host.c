@@ -355,8 +355,8 @@ static bool read_signals(Controller *c, const char *key, Signals *signals) {
   return true;
 }
 
-/* The manifest inside the file. What a host acts on must stand in the JSON beside it too: whoever changed that one
-   would else be shown other ranges than those that hold. */
+/* The manifest inside the file. Entries that a host acts on must stand in the JSON beside it too: whoever changed
+   that one would else be shown other ranges than those that hold. */
 static bool find_manifest(Controller *c, const Json *beside) {
   static const char *const ACTED_ON[] = {"schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv"};
   OrtModelMetadata *metadata = NULL;

@@ -17,7 +17,7 @@ const same = (a, b) => [...a].sort().join() === [...b].sort().join();
 
 const MOVE_ROUNDING = 1e-9; // share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
 
-// What a host acts on. It must stand in the .json too: whoever changed that one would else be shown other ranges.
+// Entries that a host acts on. They must stand in the .json too: whoever changed that one would else be shown other ranges.
 const ACTED_ON = ["schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv"];
 
 export class Controller {
@@ -324,7 +324,7 @@ function notFinite(label, signals, values) {
   return bad >= 0 ? `${label} ${signals[bad].name} is ${word(values[bad])}` : "";
 }
 
-// What an error says; anything may be thrown.
+// The words of an error; anything may be thrown.
 export function wordsOf(error) {
   try {
     return String(error?.message ?? error);

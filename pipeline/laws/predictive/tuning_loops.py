@@ -51,9 +51,9 @@ REACH = 0.8  # of the MVs' range -1..1: where the set points are rests
 GAINS = (0, 1, -1, 1, -1, 0)
 PACES = (0, -1, 1, -1, 1, 0)  # powers of 1 + the error of pace, by loop
 LATE = (0, 1, 0, 1, 0, 0)  # multiples of DEAD by which a plant is late, by loop; LATEST_LOOP has its own
-# As late as the record leaves open, and as the model in all else: a model with another dead time explains the record
-# alike, so that its gain and its pace are no further off. Slow plants of a high gain that were so late, too, cost 20 to
-# 40 % of error under loads where the model's dead time was right.
+# The loop as late as the record leaves open, and as the model in all else: a model with another dead time explains the
+# record alike, so that its gain and its pace are no further off. Slow plants of a high gain that were so late, too,
+# cost 20 to 40 % of error under loads where the model's dead time was right.
 LATEST_LOOP = 5
 GAIN, PACE, DEAD = 0.25, 0.15, 0.5  # least errors; larger ones of pace and dead time calm loops that need no calm
 MOST = 1.0  # of each error

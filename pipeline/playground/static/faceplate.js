@@ -92,7 +92,7 @@ export class Faceplate {
     this.info.replaceChildren(...names.flatMap((name, i) => [element("dt", {}, name), element("dd", {}, figure(scan?.info?.[i]))]));
   }
 
-  // What another reset or another test changed.
+  // Shows the changes of another reset or another test.
   fresh() {
     this.choice.value = this.simulation.chosen[this.lane === "A" ? 0 : 1];
     this.hands.forEach((hand, i) => hand.fresh(this.here.loop.mv[i]));

@@ -63,7 +63,7 @@ export class Simulation {
     this.sp = [...values];
   }
 
-  // One period. What is set by hand before it holds for all of it.
+  // One period. A value set by hand before it holds for all of it.
   step() {
     return this.alone(async () => {
       if (this.stopped) return;
@@ -92,7 +92,7 @@ export class Simulation {
     });
   }
 
-  // What the test moves at this sample; between its moves, what was set by hand stays.
+  // The moves of the test at this sample; between them, what was set by hand stays.
   #follow() {
     const course = this.test.course;
     for (; this.next < course.length && course[this.next][0] <= this.k; this.next++) {

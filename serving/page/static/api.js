@@ -1,4 +1,4 @@
-// What the page asks its server for.
+// Everything that the page asks its server for.
 
 const PATIENCE_MS = 20000; // for the answer to a change
 const AGAIN_MS = 2000; // before a stream that the browser has given up is opened anew

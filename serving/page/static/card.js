@@ -124,7 +124,7 @@ export function show(state) {
   verdicts(state.verdicts || []);
 }
 
-// What needs somebody comes first; the rest is counted, and listed on demand. Written only where something is new.
+// Verdicts that need somebody come first; the rest is counted, and listed on demand. Written only where something is new.
 function verdicts(found) {
   const text = JSON.stringify(found);
   if (text === judged) return;

@@ -8,7 +8,7 @@ const LABELS = { time: 76, seconds: 66, minutes: 46, value: 20 }; // pixels that
 const AXIS = { line: 28, lines: 44 }; // pixels below a chart: for times, and for times with days below them
 const SYNC = window.uPlot.sync("loop");
 
-// What is drawn of a loop: charts with their lines. `kind` says how a line looks.
+// The drawing of a loop: charts with their lines. `kind` says how a line looks.
 export function plan(about) {
   const { sp, pv, mv, dv } = about.signals;
   const charts = pv.map((s, i) => ({

@@ -136,7 +136,7 @@ function askValues(title, words, signals, present, what) {
 
 const choice = (value, signal) => String(Number(number(value, signal)));
 
-// What stands in the field at first: the present value as it is shown; of a discrete signal the nearest it may have.
+// The value in the field at first: the present value as it is shown; of a discrete signal the nearest it may have.
 function offered(value, signal) {
   if (value === null) return "";
   if (!signal.values) return Number(number(value, signal));

@@ -87,7 +87,7 @@ function build() {
   charts.build(plan(about).filter((chart) => !(hidden.has(chart.name) || (chart.optional && !hidden.has(`+${chart.name}`)))), data);
 }
 
-// Which signals are drawn; the law's own numbers only when they are asked for.
+// The signals that are drawn; the law's own numbers only when they are asked for.
 function choice() {
   $("shown").replaceChildren(
     ...plan(about).map((chart) => {
@@ -202,7 +202,7 @@ const lost = () => {
   broken = true;
   watch();
 };
-// What happened meanwhile is asked for: the stream fills up scans, not events.
+// Events of the meantime are asked for: the stream fills up scans, not events.
 const found = () => {
   if (!broken) return;
   broken = false;

@@ -28,7 +28,7 @@ export function steer(box, view, { changed, read }) {
   fingers(box, view, changed);
 }
 
-// What is under the fingers stays under them.
+// The part under the fingers stays under them.
 function fingers(box, view, changed) {
   const down = new Map(); // pointer -> x
   let began = null; // { first: x of the fingers, bounds, left, width, moves }

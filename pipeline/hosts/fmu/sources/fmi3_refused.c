@@ -1,4 +1,4 @@
-/* What FMI 3.0's header declares and a controller has no use for: each function refuses. Included by fmi3.c. */
+/* Functions that FMI 3.0's header declares and a controller has no use for: each refuses. Included by fmi3.c. */
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 
 #define REFUSED(Name, ...)                                                                                             \

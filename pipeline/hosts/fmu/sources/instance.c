@@ -15,7 +15,7 @@ enum { VR_TIME, VR_FAULT, VR_USE_APPLIED, VR_FIRST };
 enum { G_SP, G_PV, G_DV, G_APPLIED, G_START, G_MV, G_INFO, GROUPS };
 static const char *const GROUP[GROUPS] = {"sp", "pv", "dv", "mv_applied", "mv_start", "mv", "info"};
 
-/* What an instance remembers is one block of doubles, so that it is saved and restored at once: these entries, the
+/* The memory of an instance is one block of doubles, so that it is saved and restored at once: these entries, the
    variables, the law's state. */
 enum { PHASE, BEGINS, NOW, SAMPLES, FAULT, USE_APPLIED, APPLIED_IS_SET, OWN };
 enum { INSTANTIATED, INITIALIZING, STEPPING, TERMINATED };
