@@ -13,6 +13,8 @@ and `loopwright run` instead, gates and all, and steps the files that are shippe
 ``python benchmarks/own_plants --closed PLANT ... [--rows N] [--fit]``: the plants whose records were taken in closed
 loop, and what the product makes of the file of a historian (``closed_benchmark.py``); ``--closed development`` is the
 half that may be looked at while a method is chosen. 3 to 5 minutes of two cores a plant, with ``--fit`` 1 to 2.
+``--observed PLANT ...``: what the NMPC reaches behind a Kalman filter, with the noise that a controller has
+(``observed.py``); some minutes a plant.
 ``--refused [KIND ...]``: records of which no controller may come, and how many slip through (``closed_refused.py``).
 """
 
@@ -34,6 +36,7 @@ from closed_untouched import CLOSED_UNTOUCHED
 from development import DEVELOPMENT
 from further import FURTHER
 from loops import Score, scored
+from observed import observed_main
 from open_product import run_row
 from plant import OwnPlant
 from store import bound_of, model_of
@@ -115,6 +118,9 @@ def main(argv: list[str]) -> int:
     add("--closed", nargs="*", choices=closed, metavar="PLANT", help=f"{what}: {', '.join(closed)} (development)")
     add("--fit", action="store_true", help="of --closed: model and predictive law alone, no stages")
     add("--seed", type=int, default=0, help="of the records of --closed (0)")
+    every = [*plants, *PLANTS]
+    add("--observed", nargs="*", choices=every, metavar="PLANT", help="the NMPC behind a filter instead (all)")
+    add("--sequences", type=int, default=3, help="of the tests of --observed (3)")
     add("--refused", nargs="*", choices=[*KINDS], metavar="KIND", help=f"records to refuse: {', '.join(KINDS)} (all)")
     add("--count", type=int, default=20, help="of each kind of --refused (20)")
     add("--minutes", type=float, default=MINUTES, help=f"of the search for a model of --refused ({MINUTES:g})")
@@ -124,6 +130,8 @@ def main(argv: list[str]) -> int:
         names = [n for name in options.closed or ["development"] for n in GROUPS.get(name, [name])]
         rows = options.rows or CLOSED_ROWS
         return closed_main(names, rows, fit=options.fit, seed=options.seed, pid_of=pid_of)
+    if options.observed is not None:
+        return observed_main([(plants | PLANTS)[name]() for name in options.observed or every], options.sequences)
     if options.refused is not None:
         return refused_main(options.refused or list(KINDS), options.count, options.minutes)
     options.rows = options.rows or ROWS

@@ -18,6 +18,7 @@ import numpy as np
 from closed_plant import ClosedPlant
 from loops import LoopTest, Score, scores, tests_of
 from plant import OwnPlant
+from store import bound_of
 
 from loopwright.pipeline.evaluation.case import Effort
 from loopwright.pipeline.optimal.perfect import PerfectNmpc
@@ -120,11 +121,15 @@ def observed(plant: OwnPlant, tests: list[LoopTest], pace: float) -> Score:
     return scores(plant, tests, np.array(ys), np.array(us))
 
 
-def observed_row(plant: OwnPlant, sequences: int) -> str:
-    """A row of text: errors on set points and on loads of each pace, of so many tests."""
-    tests = tests_of(plant)
-    cells = []
-    for pace in PACES:
-        found = [observed(plant, tests[name][:sequences], pace).nmae for name in ("set points", "loads")]
-        cells.append("{:5.2f} {:5.2f}".format(*found))
-    return f"{plant.name:12} " + " | ".join(cells)
+def observed_main(plants: list[OwnPlant], sequences: int) -> int:
+    """Print a row a plant: the NMPC of ``bound_of``, and errors on set points and on loads of each pace."""
+    print(f"{'':12} {'NMPC':>6}" + "".join(f" | pace {pace:<7g}" for pace in PACES))
+    for plant in plants:
+        own = plant.bounding if isinstance(plant, ClosedPlant) else plant
+        tests = tests_of(own)
+        cells = [f"{plant.name:12} {bound_of(own, sequences):6.2f}"]
+        for pace in PACES:
+            found = [observed(own, tests[name][:sequences], pace).nmae for name in ("set points", "loads")]
+            cells.append("{:5.2f} {:6.2f}".format(*found))
+        print(" | ".join(cells), flush=True)
+    return 0

@@ -11,7 +11,7 @@ from benchmark_modules import own_plants_modules
 
 from loopwright.pipeline.simulation.simulate import simulate_closed
 
-MODULES = ("plant", "development", "untouched", "record", "loops")
+MODULES = ("plant", "development", "untouched", "record", "loops", "store", "closed_plant", "observed")
 
 
 @pytest.fixture(scope="module")
@@ -86,3 +86,21 @@ def test_an_upset_reaches_the_output_beside_the_plant(own: Any) -> None:
     tenth = 0.1 * np.array([s.high - s.low for s in plant.sp_signals])
     for i in range(2):
         assert tests[0].upset[:, i].max() == pytest.approx(tenth[i], rel=1e-3)
+
+
+def test_the_filter_of_the_observed_nmpc_finds_state_and_load_within_what_it_doubts(own: Any) -> None:
+    """The equations are the plant's own, so that the error over its standard deviation is that of a normal draw."""
+    plant = own.development.Exchanger()
+    x, mv = plant.rest(np.array([0.5 * (s.low + s.high) for s in plant.sp_signals]))
+    true, nominal, rng = plant.parameters({"load": 6.0}), plant.parameters(), np.random.default_rng(4)
+    filtered = own.observed.Observer(plant, own.observed.moving_of(plant, 0.1), x, nominal)
+    for k in range(400):
+        filtered.see(plant.measure(x) + plant.noise_std * rng.standard_normal(1))
+        moved = mv + 10.0 * np.sign(np.sin(k / 20))
+        filtered.go_on(moved, nominal)
+        x = plant.step(x, moved, plant.dv_nominal, true)
+    doubts = np.sqrt(np.diag(filtered.cov))
+    assert doubts[-1] < 2.0
+    assert abs(filtered.z[-1] - 6.0) < 3 * doubts[-1]
+    assert (np.abs(filtered.z[:-1] - x) < 4 * doubts[:-1]).all()
+    assert filtered.told(nominal)[plant.parameter_names().index("load")] == filtered.z[-1]
