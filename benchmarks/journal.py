@@ -11,7 +11,7 @@ import argparse
 import numpy as np
 
 from loopwright.serving.journal.entries import packed
-from loopwright.serving.journal.writer import BLOCK
+from loopwright.serving.journal.writer import BLOCK_SCANS
 
 SET_POINTS, STEP = 3, 400 / 4096
 YEAR_S = 365.25 * 86_400
@@ -21,7 +21,7 @@ def bytes_a_scan(numbers: int, kind: str) -> float:
     """Bytes of a packed scan."""
     rng = np.random.default_rng(0)
     base, rows = rng.normal(size=numbers).cumsum() + 300, []
-    for k in range(BLOCK):
+    for k in range(BLOCK_SCANS):
         values = base + 0.1 * rng.normal(size=numbers)
         values[:SET_POINTS] = base[:SET_POINTS]
         if kind == "REAL":
@@ -29,7 +29,7 @@ def bytes_a_scan(numbers: int, kind: str) -> float:
         elif kind == "12 bits":
             values = np.round(values / STEP) * STEP
         rows.append((k, 1, 1e9 + k + 1e-4 * rng.normal(), "AUTO", values.tobytes(), None, None))
-    return len(packed(rows)) / BLOCK
+    return len(packed(rows)) / BLOCK_SCANS
 
 
 def main() -> None:

@@ -121,12 +121,12 @@ def read_controller(path: Path, pinned: str | None) -> bytes:
 
 
 def _check_kind(info: os.stat_result) -> None:
-    """ArtifactError unless it is a regular file of at most MAX_BYTES: a pipe or a device may never end."""
+    """ArtifactError unless it is a regular file of at most MAX_GRAPH_BYTES: a pipe or a device may never end."""
     if not stat.S_ISREG(info.st_mode):
         kind = next((word for is_kind, word in _KINDS if is_kind(info.st_mode)), "no regular file")
         raise ArtifactError(f"the path is {kind}; a controller is a regular file")
-    if info.st_size > audit.MAX_BYTES:
-        raise ArtifactError(f"the file has {info.st_size} bytes; a controller has at most {audit.MAX_BYTES}")
+    if info.st_size > audit.MAX_GRAPH_BYTES:
+        raise ArtifactError(f"the file has {info.st_size} bytes; a controller has at most {audit.MAX_GRAPH_BYTES}")
 
 
 _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (

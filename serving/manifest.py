@@ -12,12 +12,12 @@ from loopwright.serving.errors import ArtifactError
 from loopwright.serving.fields import MAX_DIGITS, refused, shown
 from loopwright.serving.words import ACTS
 
-SCHEMA = 1  # of the manifest: a runtime refuses another
+MANIFEST_SCHEMA = 1  # of the manifest: a runtime refuses another
 MANIFEST_KEY = "loopwright.manifest"
 INPUTS = ("sp", "pv", "dv", "mv_applied", "state")
 MAX_CHARACTERS = 2**20  # of a manifest
 MAX_NAME = 200  # characters
-MAX_DEPTH = 20  # of lists and objects in each other
+MAX_MANIFEST_DEPTH = 20  # of lists and objects in each other
 MAX_STATE = 1_000_000  # numbers of a law's memory
 SHORTEST_S, LONGEST_S = 1e-6, 1e9  # a period
 SENSITIVE = "sensitive_after_steps"  # in the provenance: steps after which loops on two machines part by rounding
@@ -126,7 +126,7 @@ class Manifest:
     n_state: int
     info: tuple[str, ...]
     inputs: tuple[str, ...]
-    schema: int = SCHEMA
+    schema: int = MANIFEST_SCHEMA
     provenance: dict[str, Any] = field(default_factory=dict)
     evidence: dict[str, Any] = field(default_factory=dict)
 
@@ -180,9 +180,9 @@ class Manifest:
         if not isinstance(row, dict):
             raise ArtifactError("the manifest is not a JSON object")
         schema = row.get("schema")
-        if type(schema) is not int or schema != SCHEMA:
+        if type(schema) is not int or schema != MANIFEST_SCHEMA:
             raise ArtifactError(
-                f"the manifest has schema {str(schema)[:MAX_NAME]}; this runtime reads schema {SCHEMA}: "
+                f"the manifest has schema {str(schema)[:MAX_NAME]}; this runtime reads schema {MANIFEST_SCHEMA}: "
                 "export the controller again or use the matching release of loopwright"
             )
         missing = [f.name for f in fields(cls) if f.name not in row]
@@ -202,7 +202,7 @@ class Manifest:
                 n_state=row["n_state"],
                 info=tuple(map(_name, _list(row["info"]))),
                 inputs=tuple(map(_name, _list(row["inputs"]))),
-                schema=SCHEMA,
+                schema=MANIFEST_SCHEMA,
                 provenance=_dict(row["provenance"]),
                 evidence=_dict(row["evidence"]),
                 **signals,
@@ -232,7 +232,7 @@ def strictly(text: str, most: int = MAX_CHARACTERS) -> Any:
     except (ValueError, RecursionError) as error:
         raise ArtifactError(f"the manifest is not JSON: {error}") from error
     # Whoever walks or writes it again would fail where it is too deep.
-    if why := refused(row, MAX_DEPTH):
+    if why := refused(row, MAX_MANIFEST_DEPTH):
         raise ArtifactError(f"the manifest has {why}")
     return row
 

@@ -18,9 +18,9 @@ from loopwright.serving.ranges import numbers
 # --------------------------------------------------------------------- MVs after commands that did not reach the plant
 Array: TypeAlias = NDArray[np.float64]
 
-SAME = 1e-3  # of an MV's range: a read-back no farther than that from where it was expected has not moved
-ROUNDING = 1e-9  # of an MV's range: less is no offset, and the read-back itself is where the MV stands
-SETTLED = 5  # equal commands in a row: a read-back that lags has followed
+SAME_READ_BACK = 1e-3  # of an MV's range: a read-back no farther than that from where it was expected has not moved
+OFFSET_ROUNDING = 1e-9  # of an MV's range: less is no offset, and the read-back itself is where the MV stands
+EQUAL_COMMANDS = 5  # equal commands in a row: a read-back that lags has followed
 
 
 class StandingMv:
@@ -34,8 +34,8 @@ class StandingMv:
     def __init__(self, signals: Sequence[Signal], mv: Array) -> None:
         span = np.array([s.high - s.low for s in signals])
         self._low, self._high = np.array([s.low for s in signals]), np.array([s.high for s in signals])
-        self._same = SAME * span
-        self._least = ROUNDING * span
+        self._same = SAME_READ_BACK * span
+        self._least = OFFSET_ROUNDING * span
         self._most = np.array([0.0 if s.values is not None else READ_BACK_MARGIN for s in signals]) * span
         self.mv = mv.copy()  # shape: (n_mv,)
         self._rested = 0
@@ -60,7 +60,7 @@ class StandingMv:
     def seen(self, applied: Array) -> Array | None:
         """A read-back (n_mv,). Where the MVs stand after a loss, else None: HOLD then keeps what it has."""
         if not self.lost:
-            if self._rested >= SETTLED:
+            if self._rested >= EQUAL_COMMANDS:
                 off = applied - self.mv
                 self._seen = np.where((self._least < np.abs(off)) & (np.abs(off) <= self._most), off, 0.0)
             return None

@@ -24,7 +24,7 @@ from loopwright.pipeline.cases.batch_reactor.case import PLAIN as WITHOUT
 from loopwright.pipeline.evaluation import law_evidence
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.evidence import Evidence
-from loopwright.pipeline.evaluation.validation import SCHEMA, Validation
+from loopwright.pipeline.evaluation.validation import VALIDATION_SCHEMA, Validation
 from loopwright.pipeline.evaluation.verdicts import PLAIN, Claims
 from loopwright.pipeline.export.controller_file import file_bytes, write_sidecar
 from loopwright.pipeline.report.page import write_report
@@ -247,7 +247,7 @@ def write_validation(
         worse = {test: spread(error * (1.2 + 0.1 * i), metric) for test, error in errors.items()}
         forms[name] = {"setting": setting, "info": info, "tests": worse}
     metrics: dict[str, Any] = {
-        "schema": law_evidence.SCHEMA,
+        "schema": law_evidence.METRICS_SCHEMA,
         "name": law,
         "title": law.upper(),
         "metric": metric,
@@ -289,7 +289,7 @@ def evidence(scores: dict[str, float], lock_ups: dict[str, int] | None = None, g
     what = {"id": gate_id, "weights": {"sp_a": 1.0}, "floor": 0.0, "floors": {"sp_a": 5e-4}}
     titles = {"case": "Thiosulfate CSTR", "laws": {"pid": "PID"}, "scenarios": {"sp_a": "Set points"}}
     return {
-        "schema": SCHEMA,
+        "schema": VALIDATION_SCHEMA,
         "case": CASE,
         "metric": "mae",
         "best": None,

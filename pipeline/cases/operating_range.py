@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.evaluation.case import Array
-from loopwright.pipeline.evaluation.one_side import AWAY, BEYOND
+from loopwright.pipeline.evaluation.one_side import LATER_WAY, LATER_WAY_VISITED
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
@@ -19,11 +19,12 @@ from loopwright.serving.manifest import Signal
 
 VISITED_MV, VISITED_CV = (0.1, 0.9), (0.01, 0.99)  # quantiles of the record between which tests move
 LEAST_VISITED = 0.05  # of an MV's commanded range, where that cuts the visited one
-LEVELS = 6  # set points of a sequence
-SETTLED = 0.05  # of the largest answer
-LEAST_ANSWER = 0.2  # of a CV's largest answer to an MV: a smaller one says nothing about how long it takes
-MOVING = 0.05  # of the CV's visited range in the last quarter of RESTING: a CV that moves more does not settle
-TIMES, HOLD = 3, (30, 400)  # a set point lasts so many times as long as an answer; the fewest and most samples
+TEST_LEVELS = 6  # set points of a sequence
+ANSWER_SETTLED = 0.05  # of the largest answer
+LEAST_TIMED_ANSWER = 0.2  # of a CV's largest answer to an MV: a smaller one says nothing about how long it takes
+UNSETTLED_CV = 0.05  # of the CV's visited range in the last quarter of RESTING: a CV that moves more does not settle
+# a set point lasts so many times as long as an answer; the fewest and most samples
+ANSWERS_A_SET_POINT, HOLD_SAMPLES = 3, (30, 400)
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2, 0.1)  # of the distance of drawn MVs from their medians
 INWARD = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the way from the visited range's middle to its end: where a rest is tried
 
@@ -69,14 +70,14 @@ class Reach:
     def integrates(self) -> tuple[int, ...]:
         """Places of the CVs that do not settle under constant MVs."""
         late = np.abs(self._courses[:, :, -1] - self._courses[:, :, -RESTING // 4]).max(axis=(0, 1))
-        return tuple(int(i) for i in np.flatnonzero(late > MOVING * (self.cv[2] - self.cv[0])))
+        return tuple(int(i) for i in np.flatnonzero(late > UNSETTLED_CV * (self.cv[2] - self.cv[0])))
 
     @cached_property
     def hold(self) -> int:
-        """Samples of a set point: three times what the slowest CV needs, and within ``HOLD``.
+        """Samples of a set point: three times what the slowest CV needs, and within ``HOLD_SAMPLES``.
 
-        A CV that settles needs the time to ``SETTLED`` of its largest answers. One that does not settle needs the
-        time in which the strongest MV, over all of its range, carries it across its visited range: no loop could be
+        A CV that settles needs the time to ``ANSWER_SETTLED`` of its largest answers. One that does not settle needs
+        the time in which the strongest MV, over all of its range, carries it across its visited range: no loop could be
         faster.
         """
         size, needed = np.abs(self.answers), [1]
@@ -87,11 +88,11 @@ class Reach:
                 crossed = of * whole[:, None] >= self.cv[2, i] - self.cv[0, i]
                 needed.append(int(np.where(crossed.any(axis=1), crossed.argmax(axis=1), RESTING).min()))
                 continue
-            strong = np.flatnonzero(of.max(axis=1) >= LEAST_ANSWER * of.max())
+            strong = np.flatnonzero(of.max(axis=1) >= LEAST_TIMED_ANSWER * of.max())
             for j in strong:
-                away = np.abs(self.answers[j, :, i] - self.answers[j, -1, i]) > SETTLED * of[j].max()
+                away = np.abs(self.answers[j, :, i] - self.answers[j, -1, i]) > ANSWER_SETTLED * of[j].max()
                 needed.append(int(np.flatnonzero(away)[-1]) + 1 if away.any() else 1)
-        return int(np.clip(TIMES * max(needed), *HOLD))
+        return int(np.clip(ANSWERS_A_SET_POINT * max(needed), *HOLD_SAMPLES))
 
     @cached_property
     def halfway(self) -> int:
@@ -124,13 +125,13 @@ class Reach:
         return found
 
     def set_points(self, plant: Simulator, seed: int, p: Array | None = None) -> Array:
-        """Set points (LEVELS * hold, n_cv) that a plant can hold under its parameters p (n_p,), each held."""
+        """Set points (TEST_LEVELS * hold, n_cv) that a plant can hold under its parameters p (n_p,), each held."""
         return self.drawn(plant, seed, p)[0]
 
     def drawn(self, plant: Simulator, seed: int, p: Array | None = None) -> tuple[Array, bool]:
         """(``set_points``, whether the plant rests at each: else where it starts stands in for one)."""
         rng = np.random.default_rng(seed)
-        draws = rng.uniform(self.mv[0], self.mv[2], (LEVELS, self.mv.shape[1]))
+        draws = rng.uniform(self.mv[0], self.mv[2], (TEST_LEVELS, self.mv.shape[1]))
         if self.integrates:
             levels, rests = self._balances(plant, draws, rng, p)
         else:
@@ -146,11 +147,12 @@ class Reach:
         """Whether a plant with the parameters p (n_p,) stays where it answers to, under each MV at its ends.
 
         An error of the gain takes a model beyond its record, where it may run away from what it had reached. It may go
-        on by ``AWAY`` of the visited range, and ``BEYOND`` times as far as without the errors: a slow one does.
+        on by ``LATER_WAY`` of the visited range, and ``LATER_WAY_VISITED`` times as far as without the errors: a slow
+        one does.
         """
         span = self.cv[2] - self.cv[0]
         further, usual = (self._goes_on(plant, of) for of in (p, plant.parameters()))
-        return bool(np.all(further <= np.maximum(AWAY * span, BEYOND * usual)))
+        return bool(np.all(further <= np.maximum(LATER_WAY * span, LATER_WAY_VISITED * usual)))
 
     def _goes_on(self, plant: IdentifiedPlant, p: Array) -> Array:
         """How far the CVs (n_cv,) move at most after their answers to each MV at an end of its range."""
@@ -167,9 +169,9 @@ class Reach:
         return np.clip(plant.measure(plant.start[0])[: self.cv.shape[1]], self.cv[0], self.cv[2])
 
     def _rests(self, plant: Simulator, draws: Array, p: Array | None) -> tuple[Array, NDArray[np.bool_]]:
-        """CVs (LEVELS, n_cv) of rests within the visited range, of each draw the farthest from the medians.
+        """CVs (TEST_LEVELS, n_cv) of rests within the visited range, of each draw the farthest from the medians.
 
-        And which (LEVELS,) there are: of the others no rest on the way to the medians lies within.
+        And which (TEST_LEVELS,) there are: of the others no rest on the way to the medians lies within.
         """
         scaled = self.mv[1] + np.array(SCALES)[:, None, None] * (draws - self.mv[1])
         x = settled(plant, plant.start[0], scaled.reshape(-1, draws.shape[1]), p)
@@ -187,7 +189,7 @@ class Reach:
     def _balances(
         self, plant: Simulator, draws: Array, rng: np.random.Generator, p: Array | None
     ) -> tuple[Array, bool]:
-        """CVs (LEVELS, n_cv) of rests, with levels drawn for those that integrate; and whether all are rests."""
+        """CVs (TEST_LEVELS, n_cv) of rests, with levels drawn for those that integrate; and whether all are rests."""
         which, (start, mv0) = list(self.integrates), plant.start
         wanted = rng.uniform(self.cv[0, which], self.cv[2, which], (len(draws), len(which)))
         found, rests = np.tile(plant.measure(start)[: self.cv.shape[1]], (len(draws), 1)), True

@@ -26,7 +26,7 @@ from loopwright.pipeline.simulation.rests import answered
 
 MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
-CURVE = 101  # values of an MV over its range at which the models' turns are sought: 1 % apart
+CURVE_MV_VALUES = 101  # values of an MV over its range at which the models' turns are sought: 1 % apart
 
 
 class OwnEnsemble(Case):
@@ -144,7 +144,7 @@ class OwnEnsemble(Case):
         if len(found.mv) != 1 or len(found.sp) != 1 or not self.ready:
             return found
         (mv,) = found.mv
-        values = np.linspace(mv.low, mv.high, CURVE)
+        values = np.linspace(mv.low, mv.high, CURVE_MV_VALUES)
         curves = [self._curves(path, values) for path in (self._law_file, *sorted(self.models.glob(MEMBERS)))]
         reached, rests = np.stack(curves, axis=1)
         visited = float(max(low, mv.low)), float(min(high, mv.high))

@@ -17,8 +17,9 @@ from loopwright.pipeline.plants.perturbed import SpoiltPlant, likely_error
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
-LEAST_GAIN, LEAST_PACE, LEAST_DEAD = 0.25, 0.25, 1.0
-MOST_GAIN, MOST_PACE, MOST_DEAD = 1.0, 0.8, 5.0  # twice the gain; beyond that a record tells nothing worth a test
+LEAST_GAIN_ERROR, LEAST_PACE_ERROR, LEAST_DEAD_ERROR = 0.25, 0.25, 1.0
+# twice the gain; beyond that a record tells nothing worth a test
+MOST_GAIN_ERROR, MOST_PACE_ERROR, MOST_DEAD_ERROR = 1.0, 0.8, 5.0
 
 MODEL_ARRAYS = (
     *(field.name for field in fields(IdentifiedArrays)),
@@ -41,16 +42,16 @@ class Doubts(NamedTuple):
     @classmethod
     def of(cls, arrays: Mapping[str, Array]) -> Self:
         """From ``gain_sd`` (n_mv,), ``pace_sd`` (1,) and ``dead_sd`` (1,) of an identified model."""
-        gain = likely_error(arrays["gain_sd"], LEAST_GAIN, MOST_GAIN)
-        pace = likely_error(arrays["pace_sd"], LEAST_PACE, MOST_PACE)
-        dead = likely_error(arrays["dead_sd"], LEAST_DEAD, MOST_DEAD)
+        gain = likely_error(arrays["gain_sd"], LEAST_GAIN_ERROR, MOST_GAIN_ERROR)
+        pace = likely_error(arrays["pace_sd"], LEAST_PACE_ERROR, MOST_PACE_ERROR)
+        dead = likely_error(arrays["dead_sd"], LEAST_DEAD_ERROR, MOST_DEAD_ERROR)
         return cls(tuple(map(float, gain)), float(pace[0]), float(dead[0]))
 
     def __str__(self) -> str:
         """In words."""
         gain = " to ".join(f"{g:g}" for g in sorted({round(1 + g, 2) for g in (min(self.gain), max(self.gain))}))
-        slow = f"gain {gain} times as high, {1 + self.pace:.3g} times as slow, {_periods(LEAST_DEAD)} later"
-        farthest = f"; or else as the model, {_periods(self.dead)} later" * (self.dead > LEAST_DEAD)
+        slow = f"gain {gain} times as high, {1 + self.pace:.3g} times as slow, {_periods(LEAST_DEAD_ERROR)} later"
+        farthest = f"; or else as the model, {_periods(self.dead)} later" * (self.dead > LEAST_DEAD_ERROR)
         return f"{slow}; or lower and faster by as much{farthest}"
 
 
@@ -139,16 +140,16 @@ def errors_of(plant: OwnPlant) -> list[dict[str, float]]:
     """Parameters of the spoilt plants: slow and late with a high gain; fast with a low gain; and late alone.
 
     The last one stands for the dead times that explain the record as the model's does: a model with one has about the
-    same gain and pace. There is none where they end within ``LEAST_DEAD``.
+    same gain and pace. There is none where they end within ``LEAST_DEAD_ERROR``.
     """
     d = plant.doubts
     high = {f"gain_{s.name}": 1 + error for s, error in zip(plant.mv_signals, d.gain, strict=True)}
     found = [
-        {**high, "time_constant": 1 + d.pace, "dead_time": LEAST_DEAD},
+        {**high, "time_constant": 1 + d.pace, "dead_time": LEAST_DEAD_ERROR},
         {**{name: 1 / gain for name, gain in high.items()}, "time_constant": 1 / (1 + d.pace), "dead_time": 0.0},
     ]
     late = dict.fromkeys(high, 1.0) | {"time_constant": 1.0, "dead_time": d.dead}
-    return [*found, late] if d.dead > LEAST_DEAD else found
+    return [*found, late] if d.dead > LEAST_DEAD_ERROR else found
 
 
 def _periods(count: float) -> str:

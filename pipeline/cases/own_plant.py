@@ -11,12 +11,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from loopwright.pipeline.cases.operating_range import TIMES
+from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT
 from loopwright.pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
 from loopwright.pipeline.cases.own_entries import OLD_LOOP
 from loopwright.pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
 from loopwright.pipeline.cases.own_tests import (
-    LEAST,
+    LEAST_DAILY_ROWS,
     course,
     day,
     held_load,
@@ -44,7 +44,7 @@ SPOILT = "spoilt"  # the test on models gone wrong
 LOADED = "load"  # the test with loads that nobody measures
 DAILY = "daily"  # the test with the record's own set points and loads
 MEASURED = "measured"  # the test with steps of the measured disturbances
-SHARES = (1.0, 0.5, 0.25, 0.125)  # of the errors of a plant gone wrong
+ERROR_SHARES = (1.0, 0.5, 0.25, 0.125)  # of the errors of a plant gone wrong
 PERCENT = "% of range"
 GATE = {"held_out": 0.5, "held_out_noise": 0.2, LOADED: 0.15, "spoilt": 0.15}
 GATE_WITH_MEASURED = {"held_out": 0.5, "held_out_noise": 0.2, LOADED: 0.1, MEASURED: 0.1, "spoilt": 0.1}
@@ -86,7 +86,7 @@ class OwnCase(OwnEnsemble):
     @property
     def settling_s(self) -> float:
         """A set point lasts so many times as long, within limits."""
-        return self.hold / TIMES * self.signals.period_s
+        return self.hold / ANSWERS_A_SET_POINT * self.signals.period_s
 
     @cached_property
     def asked(self) -> Array:
@@ -177,10 +177,11 @@ class OwnCase(OwnEnsemble):
         """The test on a plant gone wrong, and the share of the errors: the largest that can be controlled.
 
         The plant then rests at each set point, does not run away under an MV at its end, and a control that knows it
-        gets there in each hold. Where it does so with none of ``SHARES`` the errors are not to blame, and stay whole.
+        gets there in each hold. Where it does so with none of ``ERROR_SHARES`` the errors are not to blame, and stay
+        whole.
         """
         whole: Scenario | None = None
-        for share in SHARES:
+        for share in ERROR_SHARES:
             of = lessened(errors, share)
             sp, rests = self.reach.drawn(plant, seed, plant.parameters(of))
             test = self._test("spoilt", "", sp, plant, seed, of)
@@ -254,8 +255,8 @@ class OwnCase(OwnEnsemble):
             found.append(f"{wanted - left} of {wanted} tests with loads are left out: {why}.")
         if DAILY not in tests and self.set_points is not None:
             found.append(
-                f"There is no test of daily work: it replays {max(LEAST, self.hold)} rows or more in one piece, "
-                "all loops in automatic, and the record has none, or a model does not stay finite over them."
+                f"There is no test of daily work: it replays {max(LEAST_DAILY_ROWS, self.hold)} rows or more in one "
+                "piece, all loops in automatic, and the record has none, or a model does not stay finite over them."
             )
         return tuple(found)
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from loopwright.pipeline.cases.own_plant import LOADED, OwnCase, own_case
-from loopwright.pipeline.cases.own_tests import ROOM, load_size
+from loopwright.pipeline.cases.own_tests import LOAD_ROOM, load_size
 from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.case import Array, Case
@@ -20,7 +20,7 @@ from loopwright.pipeline.simulation.scenario import Scenario
 
 LOADS = "load_"  # at the start of a parameter that is a load
 APART = "spoilt"  # a test that needs errors of gain and dead time, which a simulator does not offer: on models
-TRIED = 1e-2  # of an MV's range: a load that the simulator's answer is measured with
+TRIED_LOAD = 1e-2  # of an MV's range: a load that the simulator's answer is measured with
 
 
 class SimulatedCase(OwnCase):
@@ -72,7 +72,7 @@ class SimulatedCase(OwnCase):
         wanted = load_size(self.reach, cv)
         answers = {}
         for name, s in zip(self.simulator.parameter_names(), self.simulator.mv_signals, strict=True):
-            tried = TRIED * (s.high - s.low)
+            tried = TRIED_LOAD * (s.high - s.low)
             answers[name] = abs(self._moved(self.simulator, name, tried, cv)) / tried
         name = max(answers, key=lambda key: answers[key])
         return name, wanted / max(answers[name], 1e-12)
@@ -81,7 +81,7 @@ class SimulatedCase(OwnCase):
         """The load on an MV, no larger than what the MV can take back within its range."""
         i = list(self.simulator.parameter_names()).index(name)
         signal, at = self.commanded.mv[i], float(self.simulator.start[1][i])
-        room = ROOM * (signal.high - signal.low)
+        room = LOAD_ROOM * (signal.high - signal.low)
         return float(np.clip(load, min(at - signal.high + room, 0.0), max(at - signal.low - room, 0.0)))
 
     def _moved(self, plant: Simulator, name: str, size: float, cv: int) -> float:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.pipeline.cases.operating_range import SCALES, TIMES, VISITED_MV, Reach, held_at
+from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT, SCALES, VISITED_MV, Reach, held_at
 from loopwright.pipeline.evaluation.case import Array
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.records.record import Record
@@ -15,19 +15,19 @@ from loopwright.pipeline.records.record_file import stretches
 from loopwright.pipeline.simulation.rests import courses
 
 # --------------------------------------------------------------------------------------------------------------- loads
-LOAD = 0.25  # standard deviations of the record's CV
+TEST_LOAD = 0.25  # standard deviations of the record's CV
 ABOVE_NOISE = 3.0  # standard deviations of the CV's measurement noise, where these are more
 LEAST_LOAD = 0.01  # of that: a smaller load is no test
-ROOM = 0.05  # of an MV's range, at each end: what holding a disturbance leaves for a controller to act in
+LOAD_ROOM = 0.05  # of an MV's range, at each end: what holding a disturbance leaves for a controller to act in
 
 
 def load_size(reach: Reach, cv: int) -> float:
     """Largest change of a CV [its unit] by a load within a hold, if no controller acts.
 
-    ``LOAD`` of the record's standard deviations; on a quiet record with much noise ``ABOVE_NOISE`` of the noise's,
+    ``TEST_LOAD`` of the record's standard deviations; on a quiet record with much noise ``ABOVE_NOISE`` of the noise's,
     because a smaller one is lost in it.
     """
-    return max(LOAD * float(reach.record.pv[:, cv].std()), ABOVE_NOISE * float(reach.model.noise_std[cv]))
+    return max(TEST_LOAD * float(reach.record.pv[:, cv].std()), ABOVE_NOISE * float(reach.model.noise_std[cv]))
 
 
 def whole_load(reach: Reach, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float:
@@ -37,7 +37,7 @@ def whole_load(reach: Reach, plant: IdentifiedPlant, cv: int, upwards: bool = Tr
     The largest change counts and not the last: a model's answer to a load may swing far out and come back.
     """
     (x, mv), name, size = plant.start, f"load_{plant.pv_signals[cv].name}", load_size(reach, cv)
-    samples, tried = reach.hold // TIMES if cv in reach.integrates else reach.hold, 1e-3 * size
+    samples, tried = reach.hold // ANSWERS_A_SET_POINT if cv in reach.integrates else reach.hold, 1e-3 * size
     loaded, free = (
         courses(plant, x, mv[None], samples, plant.parameters({name: load}))[0, :, cv] for load in (tried, 0.0)
     )
@@ -54,7 +54,7 @@ def held_load(reach: Reach, plant: IdentifiedPlant, cv: int, upwards: bool = Tru
 
     def can_hold(scale: float) -> bool:
         p = plant.parameters({name: scale * wanted})
-        return held_at(plant, (x, mv), cvs, reach.model.mv_signals, p, ROOM) is not None
+        return held_at(plant, (x, mv), cvs, reach.model.mv_signals, p, LOAD_ROOM) is not None
 
     for scale in SCALES:
         if can_hold(scale):
@@ -93,13 +93,13 @@ def _holds(plant: IdentifiedPlant, place: int, level: float) -> bool:
     (x, mv), dv, n_cv = plant.start, plant.dv_nominal, len(plant.sp_signals)
     dv[place] = level
     other = IdentifiedPlant(plant.signals, plant.arrays, mv=mv, dv=dv, most_dead_time=plant.most_dead_time)
-    return held_at(other, (x, mv), plant.measure(x)[:n_cv], plant.mv_signals, room=ROOM) is not None
+    return held_at(other, (x, mv), plant.measure(x)[:n_cv], plant.mv_signals, room=LOAD_ROOM) is not None
 
 
 # ---------------------------------------------------------------------------------------------------------- daily work
-MOST, LEAST = 2_000, 200  # rows of a window
-ROWS = 6_000  # of all windows
-BEFORE = 300  # rows, at most, over which the model's state finds itself before a window
+MOST_DAILY_ROWS, LEAST_DAILY_ROWS = 2_000, 200  # rows of a window
+DAILY_ROWS = 6_000  # of all windows
+WARM_UP_ROWS = 300  # rows, at most, over which the model's state finds itself before a window
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,25 +120,27 @@ class Day:
 
 
 def windows(record: Record, sp: Array, hold: int) -> list[slice]:
-    """Windows of rows in which all set points (n, n_cv) are known, as long as ``MOST`` allows, apart.
+    """Windows of rows in which all set points (n, n_cv) are known, as long as ``MOST_DAILY_ROWS`` allows, apart.
 
-    None is shorter than ``LEAST`` and the hold of a set point.
+    None is shorter than ``LEAST_DAILY_ROWS`` and the hold of a set point.
     """
-    least = max(LEAST, min(hold, MOST))
+    least = max(LEAST_DAILY_ROWS, min(hold, MOST_DAILY_ROWS))
     found = []
     for part in stretches(np.asarray(np.isfinite(sp).all(axis=1)), record.run, least + 2):
         n = part.stop - part.start - 2
-        count = -(-n // MOST) if n % MOST >= least or n < MOST else n // MOST
-        edges = [part.start + 1 + i * MOST for i in range(count)]
-        found += [slice(first, min(first + MOST, part.stop - 1)) for first in edges]
+        count = (
+            -(-n // MOST_DAILY_ROWS) if n % MOST_DAILY_ROWS >= least or n < MOST_DAILY_ROWS else n // MOST_DAILY_ROWS
+        )
+        edges = [part.start + 1 + i * MOST_DAILY_ROWS for i in range(count)]
+        found += [slice(first, min(first + MOST_DAILY_ROWS, part.stop - 1)) for first in edges]
     return found
 
 
 def spread(found: Sequence[slice]) -> list[slice]:
-    """Windows of ``ROWS`` rows at most, spread evenly over the record."""
+    """Windows of ``DAILY_ROWS`` rows at most, spread evenly over the record."""
     if not found:
         return []
-    n = min(len(found), ROWS // max(rows.stop - rows.start for rows in found))
+    n = min(len(found), DAILY_ROWS // max(rows.stop - rows.start for rows in found))
     return [found[(2 * i + 1) * len(found) // (2 * n)] for i in range(n)]
 
 
@@ -148,7 +150,7 @@ def day(plant: IdentifiedPlant, record: Record, sp: Array, rows: slice, *, same_
     With ``same_row`` an MV acts on the outputs of its own row: then what was done at a row stands in the next one.
     """
     n_y, run = len(plant.pv_signals), record.run
-    first = max(rows.start - BEFORE, int(np.argmax(run == run[rows.start])))
+    first = max(rows.start - WARM_UP_ROWS, int(np.argmax(run == run[rows.start])))
     y, mv = record.pv[:, :n_y], record.mv[int(same_row) :]
     p, n_loads = plant.parameters(), n_y
     x = plant.start_at(y[first])

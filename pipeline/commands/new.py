@@ -59,7 +59,7 @@ from loopwright.pipeline.report.screening import write_page
 from loopwright.pipeline.stages.paths import DATA, WORK
 from loopwright.serving.words import plain
 
-LEAST_ROWS, MOST_ROWS = 500, 200_000  # of the experiment on a simulator
+LEAST_EXPERIMENT, MOST_EXPERIMENT = 500, 200_000  # of the experiment on a simulator
 WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
          "sp": "set point", "mode": "mode of a loop (auto, manual)"}  # fmt: skip
 
@@ -72,7 +72,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--anyway", action="store_true", help="add the plant even where the data cannot carry a model")
     add("--replace", action="store_true", help="put the plant in place of an own plant of this name and its entries")
     add("--simulator", metavar="FILE", type=Path, help="a Python class or an FMU, instead of exports")
-    add("--rows", metavar="N", type=whole(LEAST_ROWS, MOST_ROWS), default=8_000,
+    add("--rows", metavar="N", type=whole(LEAST_EXPERIMENT, MOST_EXPERIMENT), default=8_000,
         help="of the experiment on a simulator (8000)")  # fmt: skip
     for role in ROLES:
         form = "TAG" if role in {"sp", "mode"} else "TAG[UNIT][=LOW..HIGH]"

@@ -13,7 +13,7 @@ from typing import Any
 
 from loopwright.pipeline.config.params import choose
 
-WIDTH = 110  # letters of a line
+PARAMETERS_WIDTH = 110  # letters of a line
 
 
 def list_or_show(table: Mapping[str, tuple[str, type[Any]]], name: str | None, what: str) -> None:
@@ -41,7 +41,7 @@ def show(params: type[Any]) -> None:
         print()
         for block in re.split(r"\n\s*\n", text):
             words = " ".join(block.replace("``", "").split())
-            print("\n".join(textwrap.wrap(words, WIDTH)) if not block.startswith("    ") else block)
+            print("\n".join(textwrap.wrap(words, PARAMETERS_WIDTH)) if not block.startswith("    ") else block)
     hints = typing.get_type_hints(params)
     for f in dataclasses.fields(params):
         if dataclasses.is_dataclass(hints[f.name]):

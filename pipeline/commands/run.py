@@ -24,7 +24,7 @@ from loopwright.pipeline.stages.code import code as list_files
 from loopwright.pipeline.stages.overview import brought_up
 
 ARTIFACTS = Path("artifacts")
-MANY = 25  # stages that a person does not read line by line
+MANY_STAGES = 25  # stages that a person does not read line by line
 STOPPED = {128 + number for number in (signal.SIGINT, signal.SIGTERM)}
 ABSENT = {"deleted", "not in cache"}  # DVC's words for a file that is not there, whether or not it ever was
 LISTS = "work/code/"  # of the files that each stage runs and reads, with their digests
@@ -216,7 +216,7 @@ def plan(changed: Mapping[str, list[str]], expected: int) -> list[str]:
         return ["nothing has changed; everything is up to date"]
     stages = "1 stage has" if len(changed) == 1 else f"{len(changed)} stages have"
     head = f"{stages} changed; with what depends on that at most {expected} run. Changed:"
-    if len(changed) > MANY:
+    if len(changed) > MANY_STAGES:
         kinds = Counter(stage.partition("@")[0] for stage in changed)
         return [head, *(f"  {kind:10} {count:3}" for kind, count in kinds.items())]
     width = max(map(len, changed))

@@ -31,7 +31,7 @@ from loopwright.serving.guard import Sample
 from loopwright.serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest
 
-RECOVER_AFTER = 5  # good samples
+LIVE_RECOVERY = 5  # good samples
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -133,7 +133,7 @@ def close_loop(
         sp=course.sp[0],
         mv=course.mv0,
         mode=Mode.AUTO,
-        recover_after=RECOVER_AFTER,
+        recover_after=LIVE_RECOVERY,
         clock=VirtualClock() if speed is None else MonotonicClock(speed),
         warm_lead_s=0.0 if speed is None else WARM_LEAD_S * speed,
     )

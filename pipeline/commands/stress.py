@@ -25,7 +25,7 @@ from loopwright.pipeline.report.stress import TABLE, StressRun, drawn_words, fai
 from loopwright.serving.manifest import Manifest
 
 # Loops, their seed, spread and faults [%], and loops of a piece of work.
-PLANTS, SEED, SPREAD, FAULTS, BATCH = 1000, 0, 2.0, 50.0, 100
+STRESS_PLANTS, STRESS_SEED, STRESS_SPREAD, STRESS_FAULTS, STRESS_BATCH = 1000, 0, 2.0, 50.0, 100
 FEW = 500  # loops that are done before workers have started
 PIECES = 4  # a worker at least, so that none waits long for the last
 
@@ -35,14 +35,14 @@ def options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     percent = real("a percentage from 0 to 100", lambda value: 0 <= value <= 100)
     add("file", metavar="CONTROLLER", type=Path, help="a controller's .onnx file")
-    add("--plants", metavar="N", type=whole(1), default=PLANTS, help=f"closed loops ({PLANTS})")
-    add("--seed", metavar="N", type=whole(0), default=SEED, help=f"of all draws ({SEED})")
-    add("--spread", metavar="PERCENT", type=percent, default=SPREAD,
-        help=f"of parameters for which the case states no range ({SPREAD:g})")  # fmt: skip
-    add("--faults", metavar="PERCENT", type=percent, default=FAULTS,
-        help=f"share of the loops with a fault of an actuator ({FAULTS:g})")  # fmt: skip
+    add("--plants", metavar="N", type=whole(1), default=STRESS_PLANTS, help=f"closed loops ({STRESS_PLANTS})")
+    add("--seed", metavar="N", type=whole(0), default=STRESS_SEED, help=f"of all draws ({STRESS_SEED})")
+    add("--spread", metavar="PERCENT", type=percent, default=STRESS_SPREAD,
+        help=f"of parameters for which the case states no range ({STRESS_SPREAD:g})")  # fmt: skip
+    add("--faults", metavar="PERCENT", type=percent, default=STRESS_FAULTS,
+        help=f"share of the loops with a fault of an actuator ({STRESS_FAULTS:g})")  # fmt: skip
     add("--workers", metavar="N", type=whole(1), help="processes side by side (one a core)")
-    add("--batch", metavar="N", type=whole(1), default=BATCH, help=f"loops of a piece of work ({BATCH})")
+    add("--batch", metavar="N", type=whole(1), default=STRESS_BATCH, help=f"loops of a piece of work ({STRESS_BATCH})")
     add("--out", metavar="FOLDER", type=Path, help="where the report goes (CASE-LAW-stress)")
     add("--replay", metavar="INDEX", type=whole(0), help="run one loop again, and draw it")
 
@@ -79,7 +79,9 @@ def run(options: argparse.Namespace) -> None:
     print(f"report: {out / 'report.html'}")
 
 
-def outcomes_of(stress: Stress, plants: int, batch: int = BATCH, workers: int | None = None) -> list[StressOutcome]:
+def outcomes_of(
+    stress: Stress, plants: int, batch: int = STRESS_BATCH, workers: int | None = None
+) -> list[StressOutcome]:
     """Outcomes of the loops 0 to ``plants`` - 1, in order, on the engine."""
     here = address() is None
     wanted = workers or (1 if not here or plants <= FEW else os.cpu_count() or 1)
@@ -131,5 +133,9 @@ def _case_of(manifest: Manifest) -> Case:
 
 def _options(options: argparse.Namespace) -> str:
     """The options of a draw that differ from their defaults, as a replay needs them."""
-    given = {"seed": (options.seed, SEED), "spread": (options.spread, SPREAD), "faults": (options.faults, FAULTS)}
+    given = {
+        "seed": (options.seed, STRESS_SEED),
+        "spread": (options.spread, STRESS_SPREAD),
+        "faults": (options.faults, STRESS_FAULTS),
+    }
     return "".join(f" --{name} {value!r}" for name, (value, default) in given.items() if value != default)

@@ -13,10 +13,10 @@ FORMS = "+, -, none, gain LOW..HIGH, dead FROM..TO, with commas between them, as
 PART = re.compile(r"^(?P<what>gain|dead)\s+(?P<low>[^.\s]*(\.\d+)?[^.\s]*)\s*\.\.\s*(?P<high>\S+)$", re.IGNORECASE)
 SIGNS: dict[str, Literal["+", "-", "none"]] = {"+": "+", "-": "-", "−": "-", NONE: "none"}
 
-SURE = 3.0
+CONTRADICTION_SDS = 3.0
 """Standard deviations by which a record must be certain before it contradicts an engineer."""
 
-NOTHING = 0.1
+NO_ANSWER = 0.1
 """Change of a PV by a move of an input, both over their standard deviations in the record: a smaller answer is none."""
 
 
@@ -82,12 +82,12 @@ class Known:
         return 0 if self.sign == NONE else int(low >= 0) - int(high <= 0)
 
     def excludes(self, gain: float, sd: float, least: float = 0.0) -> bool:
-        """Whether a gain that is certain to ``sd`` [PV/input] lies outside of what is said, by ``SURE`` of them.
+        """Whether a gain certain to ``sd`` [PV/input] lies outside of what is said, by ``CONTRADICTION_SDS`` of them.
 
         ``least``: a gain below it is none.
         """
         low, high = self.gains
-        return not (low - least <= gain + SURE * sd and gain - SURE * sd <= high + least)
+        return not (low - least <= gain + CONTRADICTION_SDS * sd and gain - CONTRADICTION_SDS * sd <= high + least)
 
     def question(self, gain: float, sd: float) -> str:
         """The question where a record is certain of another gain."""

@@ -14,7 +14,7 @@ from loopwright.serving.fields import MAX_DIGITS
 SECTIONS = ("cases", "exports", "records", "models", "plants", "controllers")
 OWN = "x-"  # a key that begins so is the user's, for values that aliases repeat
 MOST_VALUES = 1_000_000  # aliases counted as often as they stand for something
-MAX_DEPTH = 50  # lists and mappings within each other: a deeper file would exhaust the stack
+MAX_PARAMS_DEPTH = 50  # lists and mappings within each other: a deeper file would exhaust the stack
 
 
 class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -81,8 +81,8 @@ def _require_shallow(text: str, path: Path) -> None:
     depth = 0
     for event in yaml.parse(text, Loader=_Loader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if depth > MAX_DEPTH:
-            raise ParamsError(f"{path} has lists or mappings nested more than {MAX_DEPTH} deep")
+        if depth > MAX_PARAMS_DEPTH:
+            raise ParamsError(f"{path} has lists or mappings nested more than {MAX_PARAMS_DEPTH} deep")
 
 
 def _values(value: object, path: Path, known: dict[int, int]) -> int:

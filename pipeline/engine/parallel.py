@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-BATCH = 500  # pieces that the scheduler is told of at a time
+SCHEDULER_BATCH = 500  # pieces that the scheduler is told of at a time
 RETRIES = 2  # of a piece whose worker was lost
-LARGE = 50_000  # bytes of a function, from which on it is sent once and not with every piece
+LARGE_FUNCTION = 50_000  # bytes of a function, from which on it is sent once and not with every piece
 
 
 def parallel_map(
@@ -116,13 +116,13 @@ def _answers(
     from distributed import as_completed
 
     shared: Any = cloudpickle.dumps((function, files))
-    if len(shared) > LARGE:
+    if len(shared) > LARGE_FUNCTION:
         # A client's data on one worker alone would be lost with it; a stage's are on its own worker, and lost with it.
         shared = client.scatter(shared, hash=False, broadcast=task is None)
     name, depth = f"piece-{uuid.uuid4().hex[:12]}", task.depth + 1 if task else 0
     keys = [f"{name}-{i}" for i in range(len(work))]
     # Pieces of pieces come first: who waits for them holds memory.
-    options = {"key": keys, "pure": False, "retries": RETRIES, "priority": depth, "batch_size": BATCH}
+    options = {"key": keys, "pure": False, "retries": RETRIES, "priority": depth, "batch_size": SCHEDULER_BATCH}
     given = {"shared": shared, "theirs": dict(fingerprint()), "depth": depth}
     futures = client.map(on_worker, [cloudpickle.dumps(item) for item in work], keys, **options, **given)
     places = {key: i for i, key in enumerate(keys)}

@@ -146,7 +146,7 @@ class Bars:
 
 
 # ----------------------------------------------------------------------------------------------------------- the lanes
-LANES = 2  # more fill no core further: a stage's pieces already go to every worker
+STAGE_LANES = 2  # more fill no core further: a stage's pieces already go to every worker
 GRACE_S = 15.0  # in which DVC ends by itself
 
 
@@ -194,7 +194,7 @@ class _Lanes:
         left, first = list(work), 0
         with selectors.DefaultSelector() as waiting, self.bars:
             while self.running or (left and not self.stopped and not first):
-                while left and len(self.running) < LANES and not self.stopped and not first:
+                while left and len(self.running) < STAGE_LANES and not self.stopped and not first:
                     process = self._begun(left.pop(0))
                     waiting.register(process.stdout, selectors.EVENT_READ, process)  # type: ignore[arg-type]
                 if self.stopped and time.monotonic() > self.patience_ends:

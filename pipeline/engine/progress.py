@@ -1,8 +1,8 @@
 """How far a piece of work is: a bar on a terminal, elsewhere a line now and then.
 
 A run of several stages shows lines, or draws bars from marked ones (``bars``), which it asks for by BARS in the
-environment. Lines come when something ends, and at most one every ``EVERY_S`` seconds, so that a run of minutes stays
-readable; short work says nothing.
+environment. Lines come when something ends, and at most one every ``LINE_EVERY_S`` seconds, so that a run of minutes
+stays readable; short work says nothing.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from loopwright.pipeline.engine.output import BARS, MARK
 
-EVERY_S, MARKED_EVERY_S = 10.0, 0.5  # [s] between two lines, for a person and for a program that draws the bar
-KNOWN = 0.2  # share of a piece after which its speed says how long the rest takes
+LINE_EVERY_S, MARKED_EVERY_S = 10.0, 0.5  # [s] between two lines, for a person and for a program that draws the bar
+SPEED_KNOWN = 0.2  # share of a piece after which its speed says how long the rest takes
 SOON_S = 5.0  # time left that is not worth a word
 
 
@@ -39,7 +39,7 @@ class Lines:
 
     def __post_init__(self) -> None:
         if self.every is None:
-            self.every = MARKED_EVERY_S if self.marked else EVERY_S
+            self.every = MARKED_EVERY_S if self.marked else LINE_EVERY_S
         self.last = self.clock()
 
     def show(self, label: str, share: float | None = None, count: str = "", left: float = 0.0) -> None:
@@ -70,7 +70,7 @@ class WorkPiece:
     def show(self, done: float, count: str = "") -> None:
         """Say how much is done, and about how long the rest takes once that can be known."""
         share = min(done / self.total, 1.0) if self.total > 0 else 1.0
-        left = (self.lines.clock() - self.begun) * (1 - share) / share if share >= KNOWN else 0.0
+        left = (self.lines.clock() - self.begun) * (1 - share) / share if share >= SPEED_KNOWN else 0.0
         self.lines.show(self.label, share, count, left)
 
 

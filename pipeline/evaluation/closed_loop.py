@@ -20,12 +20,13 @@ from loopwright.pipeline.metrics import errors, ise, mv_travel
 
 Array = NDArray[np.float64]
 
-LAST = 5  # samples at the end of a hold whose mean error is the steady-state error
+HOLD_END_SAMPLES = 5  # samples at the end of a hold whose mean error is the steady-state error
 SMALLEST_STEP = 0.02  # of the CV's range: a smaller move of the set point has no overshoot
 STEP_BAND = 0.02  # settled: within this fraction of the step ...
 RANGE_BAND = 0.002  # ... or of the CV's range, whichever is wider (a disturbance test has no step)
-FAR = 0.02  # of the CV's range: a larger error means that the loop has not reached its set point
-SWING, CROSSINGS = 0.01, 3  # of ``span``, the CV's range or its set points', changes of side: it swings to the end
+UNREACHED_ERROR = 0.02  # of the CV's range: a larger error means that the loop has not reached its set point
+# of ``span``, the CV's range or its set points', changes of side: it swings to the end
+SWING_SIZE, SWING_CROSSINGS = 0.01, 3
 LEFT = 0.25  # of the CV's range: farther beyond its ends a loop has left it
 
 
@@ -58,7 +59,7 @@ def itae(sp: ArrayLike, pv: ArrayLike, hold: int, period_s: float) -> float:
     return float(np.sum(period_s**2 * (k % hold if hold else k) * error))
 
 
-def steady_errors(sp: ArrayLike, pv: ArrayLike, hold: int, last: int = LAST) -> Array:
+def steady_errors(sp: ArrayLike, pv: ArrayLike, hold: int, last: int = HOLD_END_SAMPLES) -> Array:
     """Steady-state error of each hold, shape (holds,): |mean of its last ``last`` errors|.
 
     The mean comes before the absolute value, so measurement noise averages out. An oscillation around
@@ -113,7 +114,7 @@ def lock_ups(
     """The holds in which the loop locks up: it stays saturated and far from a set point.
 
     In the whole second half of such a hold one MV is at one end of [low, high], and |r - y| of one CV is more
-    than ``FAR`` of its ``span``, the CV's range. A slow plant or the heating of a batch may saturate for a
+    than ``UNREACHED_ERROR`` of its ``span``, the CV's range. A slow plant or the heating of a batch may saturate for a
     long time, but the error is smaller after half a hold (half a batch for a recipe). An inverse model
     outside its applicability domain can stay saturated for ever. Shapes (n,), or (n, n_cv) and (n, n_mv) with ranges
     (n_mv,) and spans (n_cv,).
@@ -127,7 +128,7 @@ def lock_ups(
     for part in holds(len(e), hold):
         half = slice(part.start + (part.stop - part.start) // 2, part.stop)
         stuck = np.all(u[half] <= bottom + near, axis=0) | np.all(u[half] >= top - near, axis=0)
-        if stuck.any() and np.all(e[half] > FAR * wide, axis=0).any():
+        if stuck.any() and np.all(e[half] > UNREACHED_ERROR * wide, axis=0).any():
             found.append(part)
     return found
 
@@ -163,17 +164,17 @@ def last_half(*courses: Array) -> slice:
     return slice((start + n) // 2, n)
 
 
-def swings(sp: Array, cv: Array, span: Array, share: float = SWING, *, whole: bool = False) -> NDArray[np.bool_]:
+def swings(sp: Array, cv: Array, span: Array, share: float = SWING_SIZE, *, whole: bool = False) -> NDArray[np.bool_]:
     """The controlled variables (n, n_cv) that still swing about their set points as the course ends.
 
     Over the last half of the last hold, or over the ``whole`` course, the error goes from one side to the
-    other at least CROSSINGS times, each time beyond a ``share`` of ``span`` (n_cv,).
+    other at least SWING_CROSSINGS times, each time beyond a ``share`` of ``span`` (n_cv,).
     """
     error = (cv - sp)[slice(None) if whole else last_half(sp)] / span
     found = np.zeros(error.shape[1], dtype=bool)
     for i, course in enumerate(error.T):
         sides = np.sign(course[np.abs(course) > share])
-        found[i] = np.count_nonzero(np.diff(sides)) >= CROSSINGS
+        found[i] = np.count_nonzero(np.diff(sides)) >= SWING_CROSSINGS
     return found
 
 

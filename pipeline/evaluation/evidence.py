@@ -23,7 +23,8 @@ from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = Mapping[str, Mapping[str, Mapping[str, float]]]
 WITHHELD = "withheld.json"
-ALIKE = 1.01  # errors over the lowest one, up to which laws are as good: seeds of the data make as much of a difference
+# errors over the lowest one, up to which laws are as good: seeds of the data make as much of a difference
+ALIKE_ERRORS = 1.01
 """In the place of a law's metrics.json: why it was not designed for the plant."""
 
 
@@ -259,14 +260,14 @@ class Evidence:
     def best(self) -> str | None:
         """The law with the lowest error on the development sequences; no scored test is used.
 
-        Errors up to ``ALIKE`` times the lowest do not say which law is better: data seeds differ by as much. The best
-        of such laws is the one whose MVs travel least there. A law that locked up on one of them, or that is not
+        Errors up to ``ALIKE_ERRORS`` times the lowest do not say which law is better: data seeds differ by as much. The
+        best of such laws is the one whose MVs travel least there. A law that locked up on one of them, or that is not
         shipped, is left out. So is one that does not beat the loop that the plant was run by before, there, in each
         test and where the record is replayed: this much of a say the scored tests have. Without development figures the
         gate score decides.
         """
         scores = self._candidates
-        alike = [n for n in scores if scores[n] <= ALIKE * min(scores.values())]
+        alike = [n for n in scores if scores[n] <= ALIKE_ERRORS * min(scores.values())]
         return min(alike, key=lambda n: (self.laws[n].development_travel, scores[n]), default=None)
 
     @cached_property
@@ -332,7 +333,9 @@ class Evidence:
         others = ", ".join(f"{n} {e:.3g}" for n, e in errors.items() if n != self.best)
         beside = f" (others: {others})" if others else ""
         lowest = errors[self.best] <= min(self._candidates.values())
-        place = "is the lowest" if lowest else f"is within {ALIKE - 1:.0%} of the lowest, and its MVs travel least"
+        place = (
+            "is the lowest" if lowest else f"is within {ALIKE_ERRORS - 1:.0%} of the lowest, and its MVs travel least"
+        )
         return f"{self._development}, which are not scored, {place}: " + (
             f"{errors[self.best]:.4g} {self.case.unit}".rstrip() + beside
         )

@@ -17,7 +17,7 @@ from loopwright.pipeline.simulation.simulate import Trajectory
 Ranges = Mapping[str, tuple[float, float]]
 """Signal -> the lowest and the highest value."""
 
-LEAST = 0.5  # % of a recorded range: what goes less far beyond it stays within
+LEAST_BEYOND_RANGE = 0.5  # % of a recorded range: what goes less far beyond it stays within
 
 
 def grounds_of(case: Case, models: Mapping[str, Any], reached: Mapping[str, Ranges]) -> Grounds | None:
@@ -65,7 +65,7 @@ def beyond(found: Ranges, recorded: Ranges) -> dict[str, float]:
         if name in recorded:
             least, most = recorded[name]
             far[name] = 100 * max(least - low, high - most) / max(most - least, 1e-300)
-    return {name: float(f"{value:.3g}") for name, value in far.items() if value >= LEAST}
+    return {name: float(f"{value:.3g}") for name, value in far.items() if value >= LEAST_BEYOND_RANGE}
 
 
 def reached_by(loops: Sequence[Trajectory], case: Case) -> dict[str, tuple[float, float]]:

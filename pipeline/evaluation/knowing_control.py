@@ -14,14 +14,14 @@ from itertools import product
 
 import numpy as np
 
-from loopwright.pipeline.evaluation.closed_loop import FAR, holds
+from loopwright.pipeline.evaluation.closed_loop import UNREACHED_ERROR, holds
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.simulation.rests import BALANCED, balanced, inside
 from loopwright.pipeline.simulation.scenario import Scenario
 
-FINE, COARSE = 9, 3  # constant values of one MV, and of each of several
-TOGETHER = 3  # most MVs of which all combinations are tried
+ONE_MV_VALUES, SEVERAL_MV_VALUES = 9, 3  # constant values of one MV, and of each of several
+COMBINED_MVS = 3  # most MVs of which all combinations are tried
 SWITCHES = (0.03, 0.06, 0.12, 0.25, 0.4, 0.6)  # of the hold; another switch is where a CV reaches its set point
 
 
@@ -37,7 +37,8 @@ class Reached:
 def reached(plant: IdentifiedPlant, test: Scenario, part: slice, x: Array, mv: Array) -> Reached:
     """The best course over a hold ``part`` of a test, from state x (n_x,) after MVs mv (n_mv,).
 
-    Near is ``FAR`` of a CV's range, as of a lock-up; parameters, loads and measured disturbances are the test's.
+    Near is ``UNREACHED_ERROR`` of a CV's range, as of a lock-up; parameters, loads and measured disturbances are the
+    test's.
     """
     sp, p, dv = test.sp[part], test.parameters(plant)[part], test.disturbances(plant)[part]
     n, n_cv = sp.shape
@@ -63,7 +64,7 @@ def reached(plant: IdentifiedPlant, test: Scenario, part: slice, x: Array, mv: A
     size = np.nan_to_num(np.abs(error) / span, nan=np.inf)
     closest = size[n // 2 :].min(axis=0).max(axis=1)  # of each course, of the CV that comes least near
     late = size[-max(n // 4, 1) :].mean(axis=(0, 2))
-    near = closest <= FAR
+    near = closest <= UNREACHED_ERROR
     best = int(np.where(near, late, np.inf).argmin()) if near.any() else int(closest.argmin())
     return Reached(bool(near.any()), states[best], moves[best])
 
@@ -85,12 +86,12 @@ def _courses(low: Array, high: Array, rest: Array | None, mv: Array, n: int) -> 
     ``rest`` are MVs that rest at the set point, None where there are none within the ranges.
     """
     n_mv = len(low)
-    if n_mv <= TOGETHER:
-        constant = np.array(list(product(*np.linspace(low, high, FINE if n_mv == 1 else COARSE).T)))
+    if n_mv <= COMBINED_MVS:
+        constant = np.array(list(product(*np.linspace(low, high, ONE_MV_VALUES if n_mv == 1 else SEVERAL_MV_VALUES).T)))
         ends = np.array(list(product(*zip(low, high, strict=True))))
     else:
         middle = mv if rest is None else rest
-        levels = np.linspace(low, high, COARSE)
+        levels = np.linspace(low, high, SEVERAL_MV_VALUES)
         constant = np.array([np.where(np.arange(n_mv) == j, level, middle) for j in range(n_mv) for level in levels])
         ends = np.array([np.where(np.arange(n_mv) == j, end, middle) for j in range(n_mv) for end in (low, high)])
     constant = np.vstack([constant, mv])

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Loop = dict[str, Array]
 Row = Mapping[str, int | float]  # figures by metric
 
-SCHEMA = 1
+METRICS_SCHEMA = 1
 """Schema of metrics.json. It changes with the meaning of an entry; a new entry with a default does not change it."""
 BASE = "base"
 """The form of a law that is shipped; the others are its variants."""
@@ -118,7 +118,7 @@ class LawMetrics:
 
     def write(self, path: Path) -> None:
         """Write the file; ValueError for NaN and infinity."""
-        write_text(path, to_json(self, SCHEMA))
+        write_text(path, to_json(self, METRICS_SCHEMA))
 
     @classmethod
     def read(cls, path: Path) -> LawMetrics:
@@ -128,7 +128,7 @@ class LawMetrics:
     @classmethod
     def of(cls, tree: Mapping[str, Any], where: str = "metrics.json") -> LawMetrics:
         """The mapping in such a file; ReportError names what is wrong with it and the remedy."""
-        return parsed(cls, tree, where, SCHEMA)
+        return parsed(cls, tree, where, METRICS_SCHEMA)
 
 
 def lock_up_text(locked_up: Mapping[str, Mapping[str, int]]) -> str:

@@ -22,6 +22,7 @@ REDUCE: Mapping[How, Callable[[Iterable[float]], float]] = {
 }
 NO_UNIT = frozenset({"", "-", "1"})
 """Units of a signal that is a plain number."""
+DRAW_SEEDS = 1_000  # added to the noise's seed for every further draw of it
 
 
 def with_unit(words: str, unit: str) -> str:

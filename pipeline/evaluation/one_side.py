@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.plants.simulator import Array, Signals
 
-LEAST = 0.1  # of the range that may be commanded, that a side must leave
+LEAST_SIDE = 0.1  # of the range that may be commanded, that a side must leave
 TURNS = 0.02  # of a curve's way, by which it comes back behind its turn: less is a curve that has become flat
 
-AWAY, BEYOND = 0.1, 3.0
+LATER_WAY, LATER_WAY_VISITED = 0.1, 3.0
 """Way that a model goes on after its answer, of its whole curve's and over that in the visited part: it is not slow."""
 
 Regions = Sequence[Mapping[str, Any]]
@@ -29,7 +29,7 @@ def on_one_side(signals: Signals, proof: Mapping[str, Any], median: float) -> Si
 
     ``proof`` of the model's figures has the regions of the MV's range by the gain there; ``median`` is that of the MV
     in the record, within the range that may be commanded. Plants of several MVs stay as they are: what one cannot do
-    there the others may. So does a plant of which less than ``LEAST`` of its range would be left.
+    there the others may. So does a plant of which less than ``LEAST_SIDE`` of its range would be left.
     """
     if len(signals.mv) != 1 or len(signals.sp) != 1:
         return signals
@@ -56,7 +56,9 @@ def before_turns(signals: Signals, values: Array, curves: Array, rests: Array, v
     # What a slow model still has to go grows with the move.
     half = 0.5 * (values[last] - values[first])
     farther = np.maximum(1.0, np.abs(values - 0.5 * (values[last] + values[first])) / half)
-    away = on > np.maximum(AWAY * way[:, None], BEYOND * on[:, first : last + 1].max(axis=1)[:, None] * farther)
+    away = on > np.maximum(
+        LATER_WAY * way[:, None], LATER_WAY_VISITED * on[:, first : last + 1].max(axis=1)[:, None] * farther
+    )
     below = [*_turns(-rising[:, middle::-1], TURNS * way), *_ends(away[:, middle::-1])]
     above = [*_turns(rising[:, middle:], TURNS * way), *_ends(away[:, middle:])]
     low = max([mv.low, *(values[middle - back] for back in below)])
@@ -80,9 +82,9 @@ def _ends(away: NDArray[np.bool_]) -> list[int]:
 
 
 def _within(signals: Signals, low: float, high: float) -> Signals:
-    """The signals with the MV's range from low to high, unless less than ``LEAST`` of it is left."""
+    """The signals with the MV's range from low to high, unless less than ``LEAST_SIDE`` of it is left."""
     mv = signals.mv[0]
-    if high - low < LEAST * (mv.high - mv.low):
+    if high - low < LEAST_SIDE * (mv.high - mv.low):
         return signals
     return replace(signals, mv=(replace(mv, low=low, high=high),))
 

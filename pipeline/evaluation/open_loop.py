@@ -54,8 +54,8 @@ def _rests(sp: Array, pv: Array, mv: Array) -> tuple[Array, Array]:
 
 # ----------------------------------------------------------------------------------------- replay: nothing is fed back
 UNSEEN = 0.2  # share of the rows, the last ones: the choice of the model's structure held them out
-MOST = 2_000  # rows
-AT_END = 1e-3  # of an MV's range
+REPLAY_ROWS = 2_000  # rows
+AT_RANGE_END = 1e-3  # of an MV's range
 
 
 class Steps(Protocol):
@@ -90,7 +90,7 @@ class Replay:
             if not asked.size:
                 found[signal.name] = {"refused": 100.0}
                 continue
-            ends = (asked <= signal.low + AT_END * span) | (asked >= signal.high - AT_END * span)
+            ends = (asked <= signal.low + AT_RANGE_END * span) | (asked >= signal.high - AT_RANGE_END * span)
             row = {
                 "distance": 100 * float(np.mean(np.abs(asked - done))) / span,
                 "more": 100 * float(np.mean(asked - done)) / span,
@@ -108,7 +108,7 @@ class Replay:
 
 
 def replay(law: Steps, record: Record, signals: Signals, ahead: int, *, same_row: bool = False) -> Replay:
-    """A law over the last fifth of a record, at most ``MOST`` rows, with the recorded PVs, disturbances and MVs.
+    """A law over the last fifth of a record, at most ``REPLAY_ROWS`` rows, with the recorded PVs, disturbances and MVs.
 
     No set point stands in a record. The law is given where the operation went: the mean of each recorded CV over the
     next ``ahead`` samples of its run. ``signals`` are the law's. An MV acts on the outputs of the next row, or with
@@ -116,7 +116,7 @@ def replay(law: Steps, record: Record, signals: Signals, ahead: int, *, same_row
     which has none, is left out. Raises RecordError where there are no two rows.
     """
     n = len(record)
-    first = max(n - round(UNSEEN * n), n - MOST, 0)
+    first = max(n - round(UNSEEN * n), n - REPLAY_ROWS, 0)
     rows, n_sp, n_pv = np.arange(first, n), len(signals.sp), len(signals.pv)
     begins = np.flatnonzero(np.r_[True, record.run[1:] != record.run[:-1]])
     ends = np.append(begins[1:], n)[np.searchsorted(begins, rows, side="right") - 1]
@@ -141,13 +141,13 @@ def replay(law: Steps, record: Record, signals: Signals, ahead: int, *, same_row
     return Replay(time_s, sp, record.pv[rows, :n_sp], asked, done)
 
 
-MOVE = 0.1  # of an MV's range
-SEEN = 1e-6  # of a controlled variable's range: less is rounding
-LONGEST = 200  # samples
+DEAD_TIME_MOVE = 0.1  # of an MV's range
+SEEN_CV_MOVE = 1e-6  # of a controlled variable's range: less is rounding
+LONGEST_DEAD_TIME = 200  # samples
 
 
 def dead_times(plant: Simulator) -> list[int | None]:
-    """For each controlled variable the first sample k >= 1 at which it answers a move at sample 0; None within LONGEST.
+    """For each CV the first sample k >= 1 at which it answers a move at sample 0; None within LONGEST_DEAD_TIME.
 
     The plant is simulated from its start with and without a move of each MV, and the quickest MV counts. A plant
     without dead time answers at k = 1.
@@ -166,10 +166,10 @@ def _answers(plant: Simulator, x: Array, mv: Array, moved: Array) -> list[int | 
     span = np.array([s.high - s.low for s in plant.pv_signals[:n]])
     found: list[int | None] = [None] * n
     still, other = np.array(x, dtype=np.float64), np.array(x, dtype=np.float64)
-    for k in range(1, LONGEST + 1):
+    for k in range(1, LONGEST_DEAD_TIME + 1):
         still, other = step(still, mv, plant.dv_nominal, p), step(other, moved, plant.dv_nominal, p)
         off = np.abs(plant.measure(other)[:n] - plant.measure(still)[:n]) / span
-        found = [k if a is None and d > SEEN else a for a, d in zip(found, off.tolist(), strict=True)]
+        found = [k if a is None and d > SEEN_CV_MOVE else a for a, d in zip(found, off.tolist(), strict=True)]
         if None not in found:
             break
     return found
@@ -179,7 +179,7 @@ def _elsewhere(signal: Signal, value: float) -> float:
     """Another value of the MV: toward the end that is further off, or another allowed one."""
     if signal.values is not None:
         return next((v for v in signal.values if v != value), value)
-    move = MOVE * (signal.high - signal.low)
+    move = DEAD_TIME_MOVE * (signal.high - signal.low)
     return value + move if value <= signal.middle else value - move
 
 

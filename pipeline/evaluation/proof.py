@@ -9,13 +9,14 @@ from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_pa
 from loopwright.pipeline.evaluation.validation import CheckedStatement
 
 MISSED = 0.5  # of a PV's motion beyond the noise: a model that misses more explains the lesser part of it
-SHARE = 0.8  # free-run error over the PV's deviation, noise and all: a model that has more hardly needs its inputs
+# free-run error over the PV's deviation, noise and all: a model that has more hardly needs its inputs
+FREE_RUN_SHARE = 0.8
 FORESEEN = 10.0  # nats: odds of 20,000 to 1 for a model whose MVs move the PV
 COUPLED = 0.25  # of the model's own worth, that integral action of several loops keeps whatever open answers are
-LIKELY = 1.5  # standard deviations of one-step predictions that suffice then
+SUFFICIENT_SDS = 1.5  # standard deviations of one-step predictions that suffice then
 HINTED = 5.0  # nats, odds of 150 to 1, that suffice beside the sign by which the old loop held the plant
 BY_REGION = ("turns", "fades")  # verdicts on answers that hold by the regions of the MV's range
-FOLLOWS = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
+FOLLOWING_SHARE = 0.15  # share of an MV's moves that the PV's past explains, from which there is feedback
 LITTLE = "the record leaves its sign open; beside the other answers it decides nothing, and all loops stand either"
 OLD_LOOP = "the record leaves it open; it holds by the old controller's sign, with which it held the plant"
 REMEDY = (
@@ -116,7 +117,7 @@ def _followed(proof: Mapping[str, Any], pv: str) -> bool:
     """Whether the free run follows a PV, by its inputs: clearly better than a model without them."""
     of = (proof.get("free_run") or {}).get(pv) or {}
     missed, share = of.get("missed"), of.get("share")
-    return missed is not None and share is not None and missed <= MISSED * of["motion"] and share <= SHARE
+    return missed is not None and share is not None and missed <= MISSED * of["motion"] and share <= FREE_RUN_SHARE
 
 
 def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> bool:
@@ -135,7 +136,7 @@ def _holds(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -
     if not shown or found["verdict"] != "uncertain" or found["direct"] is None:
         return False
     of_one_sign = found["low"] * found["high"] > 0 and found["direct"] * found["model"] > 0
-    return bool(of_one_sign and abs(found["direct"]) >= LIKELY * found["sd"])
+    return bool(of_one_sign and abs(found["direct"]) >= SUFFICIENT_SDS * found["sd"])
 
 
 def _by_region(found: Mapping[str, Any], known: Mapping[str, Any], *, shown: bool) -> bool:
@@ -177,15 +178,20 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
 def _by_the_old_loop(pv: str, found: Mapping[str, Any], known: Mapping[str, Any], proof: Mapping[str, Any]) -> bool:
     """Whether an uncertain answer holds by the sign with which the old loop held the plant, where nobody says another.
 
-    The model, all that are as likely, and one-step predictions must have it, these by ``LIKELY`` standard deviations;
-    and the inputs must foresee something of the PV, by ``HINTED``. A controller that was read backwards has the other.
+    The model, all that are as likely, and one-step predictions must have it, these by ``SUFFICIENT_SDS`` standard
+    deviations; and the inputs must foresee something of the PV, by ``HINTED``. A controller that was read backwards has
+    the other.
     """
     way, nats = (proof.get("held") or {}).get(pv, 0), ((proof.get("one_step") or {}).get(pv) or {}).get("nats", 0.0)
     if not way or known or nats < HINTED or found["verdict"] != "uncertain" or found["direct"] is None:
         return False
     least = min(way * found[name] for name in ("model", "low", "high"))
     direct = way * found["direct"]
-    return bool(least > 0 and direct >= LIKELY * found["sd"] and direct + found["sd"] <= TIMES * way * found["model"])
+    return bool(
+        least > 0
+        and direct >= SUFFICIENT_SDS * found["sd"]
+        and direct + found["sd"] <= ALLOWED_ANSWER_RATIO * way * found["model"]
+    )
 
 
 def _matters_little(pv: str, found: Mapping[str, Any], proof: Mapping[str, Any], *, shown: bool) -> bool:
@@ -240,7 +246,7 @@ def _why(pv: str, mv: str, found: Mapping[str, Any]) -> str:
         return ""
     back = "the model may be the controller, read backwards"
     if verdict == "uncertain":
-        if share > FOLLOWS:
+        if share > FOLLOWING_SHARE:
             return f"{mv} follows {pv} ({100 * share:.0f} % of its moves) and hardly moves of its own: {back}"
         return "the record shows too little of it"
     if verdict == "opposite":
@@ -250,7 +256,7 @@ def _why(pv: str, mv: str, found: Mapping[str, Any]) -> str:
     return f"one-step predictions of the same rows find {found['direct'] / found['model']:.2g} times as much"
 
 
-TIMES = 3.0
+ALLOWED_ANSWER_RATIO = 3.0
 """Answer that a record allows over the model's, up to which the model has the size that it needs."""
 
 WHY = {
@@ -296,13 +302,16 @@ def decides(known: Mapping[str, Any], found: Mapping[str, Any]) -> bool:
     """Whether a statement decides what the record leaves open of an answer (``Answer`` as a mapping).
 
     A sign alone is not enough for a controller: the model's size must be known too. Either somebody says the gain, and
-    the model has it; or one-step predictions allow, to a standard deviation, no more than ``TIMES`` of the model's.
+    the model has it; or one-step predictions allow, to a standard deviation, no more than ``ALLOWED_ANSWER_RATIO`` of
+    the model's.
     """
     if not known or found["verdict"] != "uncertain" or known["way"] * found["model"] <= 0:
         return False
     if known["verdict"] in {"model", "contradicted"}:
         return False
-    told = found["direct"] is not None and known["way"] * found["direct"] + found["sd"] <= TIMES * abs(found["model"])
+    told = found["direct"] is not None and known["way"] * found["direct"] + found["sd"] <= ALLOWED_ANSWER_RATIO * abs(
+        found["model"]
+    )
     return bool(known["size"] or told)
 
 

@@ -19,7 +19,7 @@ from loopwright.pipeline.evaluation.closed_loop import STEP_BAND, last_half, lef
 from loopwright.pipeline.evaluation.extrapolation import reached_by, widest
 from loopwright.pipeline.evaluation.knowing_control import reached
 from loopwright.pipeline.evaluation.law_evidence import BASE, Cycle
-from loopwright.pipeline.evaluation.metric import mean_of_draws, together
+from loopwright.pipeline.evaluation.metric import DRAW_SEEDS, mean_of_draws, together
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
@@ -73,9 +73,8 @@ def _period(course: Array, limit: float) -> float:
 
 # ---------------------------------------------------------------------------- the closed loops of one file over a test
 Metrics = dict[str, float]
-ROUNDS = 8  # of timing a step
+TIMING_ROUNDS = 8  # of timing a step
 TIMED = 1_000  # samples of a round
-DRAW = 1_000  # added to the noise's seed for every further draw of it
 DEVELOPED: Final = "development"  # stands for all development sequences among the names of tests
 DEVELOPMENT = 100_000  # added to the noise's seed over the development sequences
 
@@ -130,7 +129,8 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     """One test; with noise it runs ``noise_draws`` times."""
     draws = range(case.noise_draws if noise else 1)
     loops = [
-        close_loop(controller, case.plant, test, case.noise_std if noise else None, seed + DRAW * i) for i in draws
+        close_loop(controller, case.plant, test, case.noise_std if noise else None, seed + DRAW_SEEDS * i)
+        for i in draws
     ]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
     found = [seized(case, test, loop) for loop in loops]
@@ -209,7 +209,7 @@ def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, fl
     A round is the loop's first 1,000 samples. Other processes can slow it down.
     """
     n = min(len(loop.sp), TIMED + 1)
-    rounds = np.empty((ROUNDS, n - 1))
+    rounds = np.empty((TIMING_ROUNDS, n - 1))
     for taken in rounds:
         state = controller.cold_state()
         for k in range(1, n):

@@ -11,7 +11,7 @@ from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.law_evidence import FormAnalysis, Row
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 
-SCHEMA = 1
+VALIDATION_SCHEMA = 1
 """It changes with the meaning of an entry; a new entry with a default does not change it."""
 FILE = "validation.json"
 RelativeTo: TypeAlias = Literal["nmpc", "baseline", "floor"]
@@ -151,12 +151,12 @@ class Validation:
 
     def to_json(self) -> str:
         """The file's text; ValueError for NaN and infinity."""
-        return to_json(self, SCHEMA)
+        return to_json(self, VALIDATION_SCHEMA)
 
     @classmethod
     def read(cls, path: Path) -> Validation:
         """The file's content; PipelineError names what is wrong with it and the remedy."""
-        return parsed(cls, read_mapping(path), str(path), SCHEMA)
+        return parsed(cls, read_mapping(path), str(path), VALIDATION_SCHEMA)
 
     def bound(self, test: str, kind: str = "nmpc") -> float | None:
         """A bound's figure in the case's metric; None where none was computed."""

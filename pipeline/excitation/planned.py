@@ -12,13 +12,13 @@ from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.simulate import noise_draws
 
-STEP = 0.05  # of an MV's range
-SHORT, LONGEST = 200, 6_400  # periods of a run: doubled until it settles
-SETTLED = 0.05  # of the change
-EXPLODES = 1e5  # ranges of a PV within LONGEST periods: no integrator that can be controlled gets there
+FIRST_STEP = 0.05  # of an MV's range
+SHORT_RUN, LONGEST_RUN = 200, 6_400  # periods of a run: doubled until it settles
+CHANGE_SETTLED = 0.05  # of the change
+EXPLODES = 1e5  # ranges of a PV within LONGEST_RUN periods: no integrator that can be controlled gets there
 STILL_MOVES = 0.1  # of the change, in the last fifth of a run: it does not settle
-RESTS = 0.02  # of a PV's range, in LONGEST periods without a step: the start is a rest
-TRIED = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # shares of the way from the start to an end of the MV's range
+START_RESTS = 0.02  # of a PV's range, in LONGEST_RUN periods without a step: the start is a rest
+TRIED_WAYS = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # shares of the way from the start to an end of the MV's range
 CROSSED = 0.1  # of the PV's range: a plant that does not settle is measured by the time it takes to cross that
 
 
@@ -29,7 +29,7 @@ class FirstTest:
     settling_periods: int  # of the slowest answer; of a plant that does not settle, to cross CROSSED of a PV's range
     settles: bool
     at_rest: bool  # without a step the PVs stay
-    gain: tuple[tuple[float, ...], ...]  # PV x MV, by a step of STEP; per period where a plant does not settle
+    gain: tuple[tuple[float, ...], ...]  # PV x MV, by a step of FIRST_STEP; per period where a plant does not settle
     low: tuple[float, ...]  # of each MV: from there on a step alone leaves a PV's range
     high: tuple[float, ...]
 
@@ -45,11 +45,11 @@ def first_test(plant: Simulator) -> FirstTest:
     """
     _x0, mv0 = plant.start
     room = np.array([s.high - s.low for s in plant.pv_signals])
-    base = _course(plant, mv0, LONGEST)
+    base = _course(plant, mv0, LONGEST_RUN)
     _refuse_exploding(plant, base, "without a step")
     times, gains, settles = [], np.zeros((len(room), len(mv0))), True
     for j, signal in enumerate(plant.mv_signals):
-        step = STEP * (signal.high - signal.low)
+        step = FIRST_STEP * (signal.high - signal.low)
         step = step if mv0[j] + step <= signal.high else -step
         moved = mv0.copy()
         moved[j] += step
@@ -64,17 +64,17 @@ def first_test(plant: Simulator) -> FirstTest:
         else:
             slope = (change[-1] - change[4 * len(change) // 5]) / (len(change) / 5)
             gains[:, j] = slope / step
-            # A step as large as the MV's range allows, STEP as it is, says how long a hold may be.
+            # A step as large as the MV's range allows, FIRST_STEP as it is, says how long a hold may be.
             times.append(int(CROSSED / np.max(np.abs(slope) / room)))
     if not times:
         raise PlantError(
-            f"plant {plant.name!r}: no process variable answers to a step of {100 * STEP:g} % of any MV within "
-            f"{LONGEST} periods; check step() and measure()"
+            f"plant {plant.name!r}: no process variable answers to a step of {100 * FIRST_STEP:g} % of any MV within "
+            f"{LONGEST_RUN} periods; check step() and measure()"
         )
-    slowest = int(np.clip(max(times), 2, LONGEST))
-    look = int(min(LONGEST, 3 * slowest)) if settles else slowest
+    slowest = int(np.clip(max(times), 2, LONGEST_RUN))
+    look = int(min(LONGEST_RUN, 3 * slowest)) if settles else slowest
     ends = [[_reach(plant, mv0, j, end, look) for j, end in enumerate(side)] for side in _sides(plant)]
-    stays = bool(np.all(np.abs(base - base[0]) <= RESTS * room)) if len(base) else False
+    stays = bool(np.all(np.abs(base - base[0]) <= START_RESTS * room)) if len(base) else False
     return FirstTest(slowest, settles, stays, tuple(map(tuple, gains.tolist())), tuple(ends[0]), tuple(ends[1]))
 
 
@@ -110,32 +110,32 @@ def _course(plant: Simulator, mv: Array, periods: int, *, within: bool = False) 
 
 def _settled(plant: Simulator, base: Array, mv: Array) -> tuple[Array, bool]:
     """Changes (n, n_pv) by a step, over a run long enough to settle, and whether it does."""
-    length, change = SHORT, np.zeros((0, base.shape[1]))
-    while length <= LONGEST:
+    length, change = SHORT_RUN, np.zeros((0, base.shape[1]))
+    while length <= LONGEST_RUN:
         course = _course(plant, mv, length)
         n = min(len(course), len(base))
         change = course[:n] - base[:n]
         late = np.ptp(change[4 * n // 5 :], axis=0) if n > 5 else np.full(base.shape[1], np.inf)
         most = np.max(np.abs(change), axis=0, initial=0.0)
         room = np.array([s.high - s.low for s in plant.pv_signals])
-        if n == length and np.all((late <= STILL_MOVES * SETTLED * most) | (most <= 1e-9 * room)):
-            return change, bool(np.any(most > 1e-9 * room)) or length == LONGEST
+        if n == length and np.all((late <= STILL_MOVES * CHANGE_SETTLED * most) | (most <= 1e-9 * room)):
+            return change, bool(np.any(most > 1e-9 * room)) or length == LONGEST_RUN
         length *= 2
     return change, bool(np.all(late <= STILL_MOVES * most))
 
 
 def _settling(change: Array, room: Array) -> int:
-    """Periods after which every PV that moves stays within SETTLED of its end."""
+    """Periods after which every PV that moves stays within CHANGE_SETTLED of its end."""
     longest = 1
     for y in change[:, np.max(np.abs(change), axis=0) > 1e-6 * room].T:
-        outside = np.flatnonzero(np.abs(y - y[-1]) > SETTLED * np.max(np.abs(y)))
+        outside = np.flatnonzero(np.abs(y - y[-1]) > CHANGE_SETTLED * np.max(np.abs(y)))
         longest = max(longest, int(outside[-1]) + 1 if outside.size else 1)
     return longest
 
 
 def _reach(plant: Simulator, mv0: Array, j: int, end: float, periods: int) -> float:
-    """The MV's value nearest to ``end``, of TRIED, under which no PV leaves its range within ``periods``."""
-    for share in TRIED:
+    """The MV's value nearest to ``end``, of TRIED_WAYS, under which no PV leaves its range within ``periods``."""
+    for share in TRIED_WAYS:
         mv = mv0.copy()
         mv[j] += share * (end - mv0[j])
         if len(_course(plant, mv, periods, within=True)) == periods:
@@ -143,12 +143,12 @@ def _reach(plant: Simulator, mv0: Array, j: int, end: float, periods: int) -> fl
     return float(mv0[j])
 
 
-SHORTEST, LONGEST_HOLD = 0.1, 1.5  # of the settling time
+SHORTEST_HOLD, LONGEST_HOLD = 0.1, 1.5  # of the settling time
 FEWEST_HOLDS = 60  # of each MV in the record; the holds are shorter where it would have fewer
 DV_HOLD = (1.0, 4.0)  # of the settling time
-TRIES = 12  # levels drawn until none leads a PV out of its range
+LEVEL_TRIES = 12  # levels drawn until none leads a PV out of its range
 RIM = 0.03  # of a PV's range: kept free at both ends
-LOOK = 0.25  # of the settling time, beyond a hold, that a level is tried on
+LEVEL_LOOK_AHEAD = 0.25  # of the settling time, beyond a hold, that a level is tried on
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,10 +172,10 @@ def planned(plant: Simulator, test: FirstTest, samples: int) -> ExperimentPlan:
                 "a rest in the middle of the ranges, or widen them"
             )
     longest = min(LONGEST_HOLD * test.settling_periods, samples / FEWEST_HOLDS)
-    shortest = min(max(2.0, SHORTEST * test.settling_periods), longest)
+    shortest = min(max(2.0, SHORTEST_HOLD * test.settling_periods), longest)
     mv_hold = max(1, round(shortest)), max(2, round(longest))
     dv_hold = tuple(max(2, round(min(share * test.settling_periods, samples / 20))) for share in DV_HOLD)
-    look = max(1, round((LOOK if test.settles else 1.0) * test.settling_periods))
+    look = max(1, round((LEVEL_LOOK_AHEAD if test.settles else 1.0) * test.settling_periods))
     return ExperimentPlan(samples, mv_hold, (dv_hold[0], dv_hold[1]), test.low, test.high, look)
 
 
@@ -185,8 +185,8 @@ def excited(plant: Simulator, plan: ExperimentPlan, seed: int = 0) -> Record:
     Each MV holds levels that are uniform over its range for times that are uniform in their logarithm; each measured
     disturbance does so over its own range. Before a level is set it is tried on the plant's state up to the next move
     and ``look`` periods more; one that leads a PV within RIM of an end of its range is drawn again. So a tank that
-    integrates does not run over. Where TRIES levels all lead out, the one that stays inside longest is set, for half of
-    that time.
+    integrates does not run over. Where LEVEL_TRIES levels all lead out, the one that stays inside longest is set, for
+    half of that time.
     """
     rng = np.random.default_rng(seed)
     n, (x, mv0), p = plan.samples, plant.start, plant.parameters()
@@ -201,7 +201,7 @@ def excited(plant: Simulator, plan: ExperimentPlan, seed: int = 0) -> Record:
         if due.any():
             left = np.where(due, _draw_holds(plan, len(mv0), rng), left)
             ahead = int(left.min()) + plan.look
-            levels = [np.where(due, rng.uniform(low, high), now) for _ in range(TRIES)]
+            levels = [np.where(due, rng.uniform(low, high), now) for _ in range(LEVEL_TRIES)]
             # Where a disturbance is too large for the safe range, the ends of the MVs' own ranges may hold it.
             levels += [np.where(due, [getattr(s, end) for s in plant.mv_signals], now) for end in ("low", "high")]
             now, stays = _best(plant, x, levels, dv[k], ahead)

@@ -24,7 +24,7 @@ from loopwright.serving.manifest import INPUTS, SENSITIVE, Manifest, Signal
 
 GATE_STEPS = 1_000  # of the loop in which a law and its file are compared
 GATE_TOLERANCE = 1e-9  # largest difference of an MV or a state, relative to its largest value
-TOGETHER = 200  # steps of a law side by side: more would leave the caches
+STEPS_TOGETHER = 200  # steps of a law side by side: more would leave the caches
 INFO_TOLERANCE = 1e-6
 """Tolerance of info. It is shown and never fed back, so a difference cannot grow; but entries such as
 tau_i = Kp/Ki are ratios of small differences, which carry the rounding of their terms a thousand times enlarged. One
@@ -190,7 +190,7 @@ def _of_law(law: ControlLaw, given: Mapping[str, Array]) -> Iterator[Array]:
     """The law's answers (steps, m) to what the controller was given: side by side, then one by one."""
     inputs = [torch.from_numpy(given[name]) for name in INPUTS]
     n = len(inputs[0])
-    for size in (TOGETHER, 0):
+    for size in (STEPS_TOGETHER, 0):
         rows = [slice(k, k + size) for k in range(0, n, size)] if size else range(n)
         try:
             with torch.inference_mode():

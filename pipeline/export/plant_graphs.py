@@ -17,7 +17,7 @@ from loopwright.pipeline.plants.equations import EquationPlant, rk4_step
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.graph.audit import MAX_IR
 
-OPSET = 18  # as of a law's graph
+PLANT_OPSET = 18  # as of a law's graph
 RUNS = "n"  # the first dimension of every input and output: runs side by side
 
 # Operations of CasADi that are one operator of ONNX; onnxruntime has each of them in float64.
@@ -194,7 +194,7 @@ class _Graph:
 
         inputs = ends({name: len(columns) for name, columns in self.inputs.items()})
         graph = helper.make_graph(self.nodes, self.name, inputs, ends(self.outputs), self.tensors)
-        opset = [helper.make_opsetid("", OPSET)]
+        opset = [helper.make_opsetid("", PLANT_OPSET)]
         model = helper.make_model(graph, opset_imports=opset, ir_version=MAX_IR, producer_name="loopwright")
         onnx.checker.check_model(model, full_check=True)
         return model
@@ -211,7 +211,7 @@ def _size(function: ca.Function, what: str, sparsity: ca.Sparsity) -> int:
 
 # ----------------------------------------------------------------------------------------------- the graphs of a plant
 UNROLLED = 1_500  # operations above which the substeps are a loop: a runtime takes seconds to load thousands of nodes
-TOLERANCE = 1e-9  # relative difference of a plant's graph and its equations
+PLANT_TOLERANCE = 1e-9  # relative difference of a plant's graph and its equations
 MANIPULATED = ("x", "mv", "dv", "p")
 
 
@@ -276,7 +276,10 @@ def _repeated(once: onnx.ModelProto, times: int, name: str) -> onnx.ModelProto:
     ]
     graph = helper.make_graph([loop], name, list(once.graph.input), [x_next], constants)
     model = helper.make_model(
-        graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=once.ir_version, producer_name="loopwright"
+        graph,
+        opset_imports=[helper.make_opsetid("", PLANT_OPSET)],
+        ir_version=once.ir_version,
+        producer_name="loopwright",
     )
     onnx.checker.check_model(model, full_check=True)
     return model
@@ -303,7 +306,7 @@ def _compare(plant: EquationPlant, graphs: PlantGraphs) -> None:
     ):
         results: Any = ReferenceEvaluator(model).run(None, given)
         theirs: Array = np.asarray(results[0])[0]
-        if not np.allclose(theirs, ours, rtol=TOLERANCE, atol=0.0):
+        if not np.allclose(theirs, ours, rtol=PLANT_TOLERANCE, atol=0.0):
             raise ExportError(
                 f"plant {plant.name!r}: the graph {model.graph.name!r} gives {theirs} where the plant gives {ours}"
             )

@@ -18,18 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_toeplitz, solve_triangular, toeplitz
 
-from loopwright.pipeline.config.known import NONE, NOTHING, SURE, Known
+from loopwright.pipeline.config.known import CONTRADICTION_SDS, NO_ANSWER, NONE, Known
 from loopwright.pipeline.historian.arx_model import Blocks, blocks_of
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record
 
-FINE = 6  # lags with a coefficient of their own; later ones share one
-WIDER = 1.5  # a block over the one before
-MOST_LAGS, SHORTEST = 160, 10  # lags
+FINE_LAGS = 6  # lags with a coefficient of their own; later ones share one
+LAG_BLOCK_GROWTH = 1.5  # a block over the one before
+MOST_LAGS, FEWEST_LAGS = 160, 10  # lags
 ROWS_A_COEFFICIENT = 6  # rows for each coefficient of the model: of the PV, the inputs and a constant
 SCORES = 40  # parts of the rows whose sums say how far the coefficients may be off
-FLAT = 1e-12  # eigenvalue of the regressors' covariance, over the largest, below which a direction never moved
-DRAWS = 200  # sets of coefficients of which a spread is taken
+# eigenvalue of the regressors' covariance, over the largest, below which a direction never moved
+FLAT_EIGENVALUE = 1e-12
+COEFFICIENT_DRAWS = 200  # sets of coefficients of which a spread is taken
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,23 +52,23 @@ class DirectModel:
     @classmethod
     def of(cls, y: Array, u: Array, run: NDArray[np.int64], longest: int = 40) -> DirectModel | None:
         """Fit to a PV y (n,) and its inputs u (n, m), with lags up to ``longest`` rows; None where rows are too few."""
-        longest = min(max(longest, SHORTEST), MOST_LAGS)
+        longest = min(max(longest, FEWEST_LAGS), MOST_LAGS)
         while True:
             blocks = blocks_to(longest)
             k = np.arange(longest, len(y) - 1)
             k = k[run[k - longest] == run[k + 1]]
             if len(k) >= ROWS_A_COEFFICIENT * (len(blocks) * (1 + u.shape[1]) + 1):
                 break
-            if longest <= SHORTEST:
+            if longest <= FEWEST_LAGS:
                 return None
-            longest = max(longest // 2, SHORTEST)
+            longest = max(longest // 2, FEWEST_LAGS)
         columns = [blocks_of(c - c.mean(), k, blocks) for c in (y, *u.T)]
         x = np.column_stack([*columns, np.ones(len(k))])
         target = y[k + 1] - y.mean()
         scale = np.where(x.std(axis=0) > 0, x.std(axis=0), 1.0)
         z, n = x / scale, len(k)
         values, vectors = np.linalg.eigh(z.T @ z / n)
-        least = FLAT * values[-1]
+        least = FLAT_EIGENVALUE * values[-1]
         moved = values > least
         known, lost = vectors[:, moved], vectors[:, ~moved]
         inverse = (known / values[moved]) @ known.T
@@ -82,12 +83,12 @@ class DirectModel:
     def answer(self, j: int, first: int, last: int) -> tuple[float, float]:
         """(mean answer over rows ``first`` to ``last`` after a unit step of input j, its standard deviation).
 
-        From the middle two thirds of ``DRAWS`` sets of coefficients that are as likely as these.
+        From the middle two thirds of ``COEFFICIENT_DRAWS`` sets of coefficients that are as likely as these.
         """
         rng = np.random.default_rng(0)
         values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
         spread = vectors * np.sqrt(np.maximum(values, 0.0))
-        thetas = self.theta + rng.standard_normal((DRAWS, len(values))) @ spread.T
+        thetas = self.theta + rng.standard_normal((COEFFICIENT_DRAWS, len(values))) @ spread.T
         with np.errstate(over="ignore", invalid="ignore"):
             found = self._steps(np.vstack([self.theta, thetas]), j, last)[:, first - 1 :].mean(axis=1)
         found = np.nan_to_num(found, posinf=1e300, neginf=-1e300)
@@ -114,25 +115,25 @@ class DirectModel:
 
 def blocks_to(longest: int) -> Blocks:
     """Blocks of lags from 0 to ``longest``, the first ones of one lag each, the later ones wider and wider."""
-    edges = list(range(min(FINE, longest) + 1))
+    edges = list(range(min(FINE_LAGS, longest) + 1))
     width = 2.0
     while edges[-1] < longest:
         edges.append(min(edges[-1] + int(width), longest))
-        width *= WIDER
+        width *= LAG_BLOCK_GROWTH
     return tuple(pairwise(edges))
 
 
 # ------------------------------------------------------------------------------------------ the first row of an answer
-FOLLOWED = 80  # rows after a move, whose sum has the sign of the answer
+FOLLOWED_ROWS = 80  # rows after a move, whose sum has the sign of the answer
 ROWS_AFTER, LEAD = 320, 20  # rows after a move, and before it: then the export stores it late
-SEEN = 6.0  # standard deviations of what chance gives: an answer at all
-BEGINS = 4.5  # standard deviations of the first row of an answer, of which many are looked at
-LEAST = 0.05  # of the clearest row: below it a misfit of the model looks like an answer
+ANSWER_SDS = 6.0  # standard deviations of what chance gives: an answer at all
+FIRST_ROW_SDS = 4.5  # standard deviations of the first row of an answer, of which many are looked at
+LEAST_OF_CLEAREST = 0.05  # of the clearest row: below it a misfit of the model looks like an answer
 PART, CHANCE = 0.25, 9.0  # of the largest change: an answer that begins so is excluded where its chi-squared is this
 AGAIN = 3.0  # standard deviations that are not taken for chance there
 COLOUR = 12  # rows that noise remembers
-MOST_ROWS = 400_000  # rows that are looked at
-RIDGE = 1e-6  # share of the autocovariance at lag 0, on the diagonal: keeps the equations solvable
+MOST_ANSWER_ROWS = 400_000  # rows that are looked at
+COVARIANCE_RIDGE = 1e-6  # share of the autocovariance at lag 0, on the diagonal: keeps the equations solvable
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,13 +156,13 @@ def first_answer(y: Array, u: Array, run: NDArray[np.int64]) -> FirstAnswer | No
 
     for l = -LEAD .. ROWS_AFTER - 1 by least squares on both sides filtered by 1 - a(q), so that w is white: once noise
     of y, drifts and an integrator are in a, one row more is told from noise. z_l is what lag l adds to all later ones,
-    in standard deviations: the answer begins at the first l where it is more than BEGINS. At most LEAD rows are looked
-    back. Where the z_l before a move have the other sign than the answer, they are feedback, and the answer begins
-    after the move.
+    in standard deviations: the answer begins at the first l where it is more than FIRST_ROW_SDS. At most LEAD rows are
+    looked back. Where the z_l before a move have the other sign than the answer, they are feedback, and the answer
+    begins after the move.
     """
     from scipy.signal import fftconvolve, lfilter
 
-    n = min(len(y), MOST_ROWS)
+    n = min(len(y), MOST_ANSWER_ROWS)
     du, dy = np.diff(u[:n], prepend=u[:1]), np.diff(y[:n], append=y[n - 1 : n])
     inside = run[1:n] == run[: n - 1]
     du[1:][~inside], dy[:-1][~inside] = 0.0, 0.0
@@ -173,14 +174,14 @@ def first_answer(y: Array, u: Array, run: NDArray[np.int64]) -> FirstAnswer | No
     du, dy = lfilter(white, [1.0], du), lfilter(white, [1.0], dy)
     h, z, size = _answer(du, dy)
     clearest = float(np.abs(z).max())
-    if max(clearest, float((np.abs(h) * size).max())) < SEEN:
+    if max(clearest, float((np.abs(h) * size).max())) < ANSWER_SDS:
         return None
-    least = max(BEGINS, LEAST * clearest)
+    least = max(FIRST_ROW_SDS, LEAST_OF_CLEAREST * clearest)
     begins = np.abs(z) >= least
-    answer = np.cumsum(h[LEAD : LEAD + FOLLOWED])
+    answer = np.cumsum(h[LEAD : LEAD + FOLLOWED_ROWS])
     way = float(np.sign(answer[int(np.abs(answer).argmax())]))
     before, after = -way * float(z[:LEAD].sum()) / np.sqrt(LEAD), float((way * z[LEAD:]).max())
-    feedback = before >= least and after >= SEEN
+    feedback = before >= least and after >= ANSWER_SDS
     if feedback:  # what precedes a move is its cause
         begins &= np.sign(z) == way
         begins[:LEAD] = False
@@ -211,7 +212,7 @@ def _answer(du: Array, dy: Array) -> tuple[Array, Array, Array]:
     both = np.fft.irfft(np.conj(spectrum) * np.fft.rfft(dy, size), size)
     own = np.fft.irfft(np.abs(spectrum) ** 2, size)[:lags]
     cross = np.r_[both[-LEAD:], both[:ROWS_AFTER]]
-    gram = toeplitz(own) + RIDGE * own[0] * np.eye(lags)
+    gram = toeplitz(own) + COVARIANCE_RIDGE * own[0] * np.eye(lags)
     # The same matrix from the last lag to the first: a row of its Cholesky factor adds a lag to those after it.
     factor = np.linalg.cholesky(gram)
     h = cho_solve((factor, True), cross)
@@ -229,10 +230,10 @@ def whitening(e: Array) -> Array:
 
 
 # ---------------------------------------------------------------------------- a record beside an engineer's statements
-WINDOWS = ((20, 30), (40, 60), (60, 90))
+STATEMENT_WINDOWS = ((20, 30), (40, 60), (60, 90))
 """Rows after a step over which an answer is taken; the last ones come nearest to the gain."""
 
-SETTLED = 0.1
+STATEMENT_SETTLED = 0.1
 """Share of an answer by which it may still change from the last window but one to the last where it has settled."""
 
 ANY_ANSWER = 1e3
@@ -259,29 +260,31 @@ class Beside:
     @property
     def agrees(self) -> bool:
         """Whether the record by itself is certain of the sign that is said."""
-        return self.answer is not None and self.known.way * self.answer[0] >= SURE * self.answer[1]
+        return self.answer is not None and self.known.way * self.answer[0] >= CONTRADICTION_SDS * self.answer[1]
 
 
 def beside_record(known: Sequence[Known], record: Record) -> list[Beside]:
     """Each statement beside the record.
 
     A sign is contradicted by an answer that is certain to have the other one and keeps it in the last window; ``none``
-    by one that is certain to be more than ``NOTHING``. A stated gain can only be too large for an answer that has not
+    by one that is certain to be more than ``NO_ANSWER``. A stated gain can only be too large for an answer that has not
     settled.
     """
     pvs, inputs = [s.name for s in record.pv_signals], [s.name for s in (*record.mv_signals, *record.dv_signals)]
     moves, found = np.hstack([record.mv, record.dv]), list[Beside]()
     for one in known:
         i, j = pvs.index(one.pv), inputs.index(one.input)
-        model = DirectModel.of(record.pv[:, i], moves, record.run, WINDOWS[-1][1])
+        model = DirectModel.of(record.pv[:, i], moves, record.run, STATEMENT_WINDOWS[-1][1])
         unit = float(record.pv[:, i].std() / max(moves[:, j].std(), 1e-300))
-        answers = [] if model is None else [model.answer_within(j, *rows, ANY_ANSWER * unit) for rows in WINDOWS]
+        answers = (
+            [] if model is None else [model.answer_within(j, *rows, ANY_ANSWER * unit) for rows in STATEMENT_WINDOWS]
+        )
         known_answers = [a for a in answers if a is not None]
         if not known_answers or answers[-1] is None:
             found.append(Beside(one))
             continue
         surest = max(known_answers, key=lambda a: abs(a[0]) / a[1])
-        found.append(Beside(one, surest, _objection(one, known_answers, NOTHING * unit)))
+        found.append(Beside(one, surest, _objection(one, known_answers, NO_ANSWER * unit)))
     return found
 
 
@@ -290,12 +293,12 @@ def _objection(one: Known, answers: Sequence[tuple[float, float]], nothing: floa
     last = answers[-1]
     if one.sign == NONE:
         return next((a for a in answers if one.excludes(*a, nothing)), None)
-    other = [a for a in answers if one.way * a[0] < -SURE * a[1]]
+    other = [a for a in answers if one.way * a[0] < -CONTRADICTION_SDS * a[1]]
     if other and one.way * last[0] < 0:
         return max(other, key=lambda a: abs(a[0]) / a[1])
     if one.gain is None or not one.excludes(*last):
         return None
-    settled = len(answers) > 1 and abs(last[0] - answers[-2][0]) <= max(SETTLED * abs(last[0]), last[1])
+    settled = len(answers) > 1 and abs(last[0] - answers[-2][0]) <= max(STATEMENT_SETTLED * abs(last[0]), last[1])
     low, high = one.gains
     beyond = last[0] > max(high, 0.0) or last[0] < min(low, 0.0)  # further from 0 than any gain that is said
     return last if settled or beyond else None

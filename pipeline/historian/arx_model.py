@@ -15,14 +15,14 @@ Blocks = tuple[tuple[int, int], ...]
 
 Y_LAGS = 3  # lags of the PV
 BLOCKS = ((0, 1), (1, 2), (2, 3), (3, 6), (6, 11), (11, 21), (21, 41))  # lags of an input that share a coefficient
-AHEAD = ((-1, 0), (-2, -1), (-5, -2))  # lags of an input that no plant can answer to
-MOST_ROWS, WINDOW_ROWS = 24_000, 2_000  # of the fit, in windows spread evenly over the record
-SETTLED = 0.8  # of the rows that an answer is followed: later it has not settled
+ACAUSAL_LAGS = ((-1, 0), (-2, -1), (-5, -2))  # lags of an input that no plant can answer to
+MOST_ARX_ROWS, WINDOW_ROWS = 24_000, 2_000  # of the fit, in windows spread evenly over the record
+LATEST_SETTLED = 0.8  # of the rows that an answer is followed: later it has not settled
 OUTSIDE_SD = 6.0  # residuals that the second fit leaves out
-LEAST_ROWS = 60  # rows below which no model is fitted
+LEAST_ARX_ROWS = 60  # rows below which no model is fitted
 NO_EFFECT = 2.0  # strength of an input that a prediction leaves out
 RAMPS = 5.0  # likely errors of the sum of an input's coefficients, from which y integrates it
-LONG = 1_000_000  # rows, of which a part is looked at
+LONG_RECORD = 1_000_000  # rows, of which a part is looked at
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ class Linear:
             return 0
         outside = np.flatnonzero(np.abs(answer - answer[-1]) > 0.1 * abs(answer[-1]))
         rows = int(outside[-1]) + 1 if outside.size else 1
-        return rows if rows < SETTLED * length else 0
+        return rows if rows < LATEST_SETTLED * length else 0
 
 
 def fit_arx(
@@ -97,14 +97,14 @@ def fit_arx(
 ) -> Linear | None:
     """The model of y (n,) from inputs u, (n,) each, within runs (n,); None where too few rows or no motion are there.
 
-    Rows with NaN take no part. At most MOST_ROWS rows are used, in windows spread evenly. ``integrates``: with a pole
-    at 1. ``slow``: lines in time from this many knots on to the next take up a drift, and stay out of the model.
+    Rows with NaN take no part. At most MOST_ARX_ROWS rows are used, in windows spread evenly. ``integrates``: with a
+    pole at 1. ``slow``: lines in time from this many knots on to the next take up a drift, and stay out of the model.
     """
     blocks: Blocks = BLOCKS
     while True:
         rows = rows_of(y, u, run, blocks[-1][1] - 1)
-        parameters = Y_LAGS + 1 + len(u) * (len(blocks) + len(AHEAD))
-        if len(rows) >= max(LEAST_ROWS, 3 * parameters):
+        parameters = Y_LAGS + 1 + len(u) * (len(blocks) + len(ACAUSAL_LAGS))
+        if len(rows) >= max(LEAST_ARX_ROWS, 3 * parameters):
             break
         if len(blocks) <= 3:
             return None
@@ -158,12 +158,12 @@ def lead(model: Linear, y: Array, u: Sequence[Array], i: int) -> tuple[float, in
     Their Wald statistic, and by how many rows the strongest comes before its move.
     """
     x, target, _ = _regressors(y, u, model.centre, model.rows, model.blocks, model.integrates, model.slow)
-    ahead = blocks_of(u[i] - model.centre[i], model.rows, AHEAD)
+    ahead = blocks_of(u[i] - model.centre[i], model.rows, ACAUSAL_LAGS)
     theta, cov, _ = least_squares(np.column_stack([x, ahead]), target)
     m = x.shape[1]
     t = np.abs(theta[m:]) / np.sqrt(np.maximum(np.diag(cov)[m:], 1e-300))
     best = int(np.argmax(t)) if np.isfinite(t).all() else 0
-    return _wald(theta[m:], cov[m:, m:]), -AHEAD[best][1] + 1
+    return _wald(theta[m:], cov[m:, m:]), -ACAUSAL_LAGS[best][1] + 1
 
 
 def _lines(rows: NDArray[np.int64], knots: int) -> list[Array]:
@@ -174,7 +174,7 @@ def _lines(rows: NDArray[np.int64], knots: int) -> list[Array]:
 
 def rows_of(y: Array, u: Sequence[Array], run: NDArray[np.int64], lag: int) -> NDArray[np.int64]:
     """Rows k with lag rows before and five after in their run, without NaN, in windows spread evenly."""
-    after = -AHEAD[-1][0]
+    after = -ACAUSAL_LAGS[-1][0]
     lag = max(lag, Y_LAGS - 1)
     bad = np.r_[0, np.cumsum(~whole(y, *u), dtype=np.int32)]
 
@@ -182,13 +182,13 @@ def rows_of(y: Array, u: Sequence[Array], run: NDArray[np.int64], lag: int) -> N
         return k[(run[k - lag] == run[k + after]) & (bad[k + after + 1] == bad[k - lag])]
 
     last = len(y) - after
-    if last - lag > LONG:  # a part first, so that a long record needs no long list of rows
-        starts = np.linspace(lag, last - WINDOW_ROWS, 4 * MOST_ROWS // WINDOW_ROWS).astype(np.int64)
+    if last - lag > LONG_RECORD:  # a part first, so that a long record needs no long list of rows
+        starts = np.linspace(lag, last - WINDOW_ROWS, 4 * MOST_ARX_ROWS // WINDOW_ROWS).astype(np.int64)
         k = good((starts[:, None] + np.arange(WINDOW_ROWS)).ravel())
     else:
         k = good(np.arange(lag, last))
-    if len(k) > MOST_ROWS:
-        starts = np.linspace(0, len(k) - WINDOW_ROWS, MOST_ROWS // WINDOW_ROWS).astype(np.int64)
+    if len(k) > MOST_ARX_ROWS:
+        starts = np.linspace(0, len(k) - WINDOW_ROWS, MOST_ARX_ROWS // WINDOW_ROWS).astype(np.int64)
         k = k[np.unique((starts[:, None] + np.arange(WINDOW_ROWS)).ravel())]
     return k
 
@@ -268,13 +268,14 @@ def _robust_sd(residual: Array) -> float:
 
 
 # ----------------------------------------- the choice: one that rests, one that integrates, or one beside a slow drift
-WINDOW, WINDOWS = 400, 8  # rows of a free run that is compared, and how many there are at least
-KNOTS = (32, 8)  # of lines in time that take up a drift
-SETTLINGS = 4  # between two knots at least: shorter lines take up the answers too
-AS_GOOD = 1.1  # error over another model's
-UNEXPLAINED = 0.8  # of the motion of y: an integrator that leaves more is none
-STRONG = 4.0  # inputs with an answer
-GAIN, SETTLES = 0.1, 1.3  # relative change of a gain, and ratio of two settling times: by a drift
+FREE_RUN_ROWS, FREE_RUN_WINDOWS = 400, 8  # rows of a free run that is compared, and how many there are at least
+DRIFT_KNOTS = (32, 8)  # of lines in time that take up a drift
+KNOT_SETTLINGS = 4  # between two knots at least: shorter lines take up the answers too
+AS_GOOD_ERROR = 1.1  # error over another model's
+INTEGRATOR_UNEXPLAINED = 0.8  # of the motion of y: an integrator that leaves more is none
+STRONG_INPUT = 4.0  # inputs with an answer
+# relative change of a gain, and ratio of two settling times: by a drift
+DRIFT_GAIN_CHANGE, DRIFT_SETTLING_RATIO = 0.1, 1.3
 
 
 def believed(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | None:
@@ -292,33 +293,33 @@ def believed(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | N
     ramps = [i for i in range(len(u)) if level is not None and level.ramps(i)]
     settles = any(plain.settling(i) for i in ramps)
     if level is not None and ramps and not settles:
-        most = min(AS_GOOD * error, UNEXPLAINED * _motion(y, run))
+        most = min(AS_GOOD_ERROR * error, INTEGRATOR_UNEXPLAINED * _motion(y, run))
         if free_run_error(level, y, u, run) <= most:
             return replace(level, sure=True)
-    for knots in KNOTS:
+    for knots in DRIFT_KNOTS:
         beside = fit_arx(y, u, run, slow=knots)
         if beside is None or not _within_lines(beside, len(plain.rows) / knots):
             continue
         if not _differ(plain, beside):
             return replace(plain, sure=True)
-        if free_run_error(beside, y, u, run) <= AS_GOOD * error:
+        if free_run_error(beside, y, u, run) <= AS_GOOD_ERROR * error:
             return replace(beside, sure=True)
     return plain
 
 
 def _within_lines(model: Linear, length: float) -> bool:
     """Whether every answer settles well within ``length`` rows."""
-    settling = [model.settling(i) for i, strength in model.strength.items() if strength > STRONG]
-    return bool(settling) and all(0 < rows * SETTLINGS <= length for rows in settling)
+    settling = [model.settling(i) for i, strength in model.strength.items() if strength > STRONG_INPUT]
+    return bool(settling) and all(0 < rows * KNOT_SETTLINGS <= length for rows in settling)
 
 
 def _differ(one: Linear, other: Linear) -> bool:
     """Whether two models disagree on a gain or a settling time."""
     for i, strength in other.strength.items():
-        if strength > STRONG:
+        if strength > STRONG_INPUT:
             a, b = (m.settling(i) for m in (one, other))
             gains = [float(m.step_response(i)[-1]) for m in (one, other)]
-            if not a or a > SETTLES * b or abs(gains[0] - gains[1]) > GAIN * abs(gains[1]):
+            if not a or a > DRIFT_SETTLING_RATIO * b or abs(gains[0] - gains[1]) > DRIFT_GAIN_CHANGE * abs(gains[1]):
                 return True
     return False
 
@@ -350,7 +351,7 @@ def free_run_error(model: Linear, y: Array, u: Sequence[Array], run: NDArray[np.
 def _motion(rest: Array, run: NDArray[np.int64]) -> float:
     """Standard deviation of what is left (n,) within windows, each about its own mean, NaN left out."""
     ok = np.flatnonzero(~np.isnan(rest))
-    length = max(min(WINDOW, len(ok) // WINDOWS), 2)
+    length = max(min(FREE_RUN_ROWS, len(ok) // FREE_RUN_WINDOWS), 2)
     m = len(ok) // length
     if not m:
         return float("inf")

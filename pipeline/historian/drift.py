@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.arx_model import (
     BLOCKS,
-    LEAST_ROWS,
+    LEAST_ARX_ROWS,
     NO_EFFECT,
     Blocks,
     Linear,
@@ -28,11 +28,13 @@ from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record
 
 # --------------------------------------------------------- the part of a PV that the past of the inputs alone explains
-SLOW = ((41, 81), (81, 161), (161, 321))  # lags beyond BLOCKS that share a coefficient; the last are left out first
-SETTLED = 0.15  # of an answer's largest value: within it an answer has settled
-WEAK = 0.01  # part in the answer, over the strongest input's
-MOST_SHARE = 0.05  # of the rows: longer lags explain by chance what the inputs did not cause
-CHUNK = 200_000  # rows
+
+# lags beyond BLOCKS that share a coefficient; the last are left out first
+SLOW_LAGS = ((41, 81), (81, 161), (161, 321))
+DRIFT_SETTLED = 0.15  # of an answer's largest value: within it an answer has settled
+WEAK_INPUT = 0.01  # part in the answer, over the strongest input's
+MOST_LAG_SHARE = 0.05  # of the rows: longer lags explain by chance what the inputs did not cause
+DRIFT_CHUNK = 200_000  # rows
 
 
 def explained(y: Array, u: Sequence[Array], piece: NDArray[np.int64]) -> tuple[Array, int]:
@@ -43,12 +45,12 @@ def explained(y: Array, u: Sequence[Array], piece: NDArray[np.int64]) -> tuple[A
     y (n,), each input (n,), piece (n,). All NaN, and 0, where the rows are too few for four blocks.
     """
     out = np.full(len(y), np.nan)
-    blocks: Blocks = (*BLOCKS, *SLOW)
-    while len(blocks) > len(BLOCKS) and blocks[-1][1] > MOST_SHARE * len(y):
+    blocks: Blocks = (*BLOCKS, *SLOW_LAGS)
+    while len(blocks) > len(BLOCKS) and blocks[-1][1] > MOST_LAG_SHARE * len(y):
         blocks = blocks[:-1]
     while True:
         rows = rows_of(y, u, piece, blocks[-1][1] - 1)
-        if len(rows) >= max(LEAST_ROWS, 6 * len(u) * len(blocks)):
+        if len(rows) >= max(LEAST_ARX_ROWS, 6 * len(u) * len(blocks)):
             break
         if len(blocks) <= 4:
             return out, 0
@@ -58,12 +60,12 @@ def explained(y: Array, u: Sequence[Array], piece: NDArray[np.int64]) -> tuple[A
     theta = least_squares(table, y[rows + 1])[0]
     parts = (table[:, :-1] * theta[:-1]).reshape(len(rows), len(u), len(blocks)).sum(axis=2).std(axis=0)
     # An input without a part costs as much time as one with it.
-    strong = [i for i, part in enumerate(parts) if part >= WEAK * parts.max()]
+    strong = [i for i, part in enumerate(parts) if part >= WEAK_INPUT * parts.max()]
     answers = theta[:-1].reshape(len(u), len(blocks))
     back = blocks[-1][1] - 1
     bad = np.r_[0, np.cumsum(~whole(*u), dtype=np.int32)]
-    for start in range(back, len(y) - 1, CHUNK):
-        end = min(start + CHUNK, len(y) - 1)
+    for start in range(back, len(y) - 1, DRIFT_CHUNK):
+        end = min(start + DRIFT_CHUNK, len(y) - 1)
         value = np.full(end - start, theta[-1])
         first = max(start - blocks[-1][1], 0)
         for i in strong:
@@ -82,26 +84,26 @@ def _inputs(u: Sequence[Array], centre: Array, rows: NDArray[np.int64], blocks: 
 
 
 def _settling(theta: Array, motion: Array, blocks: Blocks) -> int:
-    """Rows after which the answer to a step of the strongest input stays within SETTLED of its largest value."""
+    """Rows after which the answer to a step of the strongest input stays within DRIFT_SETTLED of its largest value."""
     answers = np.cumsum(theta[:-1].reshape(len(motion), len(blocks)), axis=1)
     strongest = answers[int(np.argmax(np.abs(answers).max(axis=1) * motion))]
-    outside = np.flatnonzero(np.abs(strongest - strongest[-1]) > SETTLED * np.abs(strongest).max())
+    outside = np.flatnonzero(np.abs(strongest - strongest[-1]) > DRIFT_SETTLED * np.abs(strongest).max())
     return blocks[min(int(outside[-1]) + 1, len(blocks) - 1)][1] - 1 if outside.size else 1
 
 
 # -------------------------------------------------------------------------------------------------- what is left of it
-BLOCK = 20  # rows at least that one level is the mean of; more where the plant is slow
-LEVELS, MOST_LEVELS = 12, 2_000  # blocks of which levels are taken: the fewest, and about the most
-WANDERS = 0.015  # of the PV's span: standard deviation of the levels
-OF_NOISE = 3.0  # of what noise alone leaves in a mean
+LEVEL_BLOCK = 20  # rows at least that one level is the mean of; more where the plant is slow
+FEWEST_LEVELS, MOST_DRIFT_LEVELS = 12, 2_000  # blocks of which levels are taken: the fewest, and about the most
+LEVEL_WANDERS = 0.015  # of the PV's span: standard deviation of the levels
+OF_MEAN_NOISE = 3.0  # of what noise alone leaves in a mean
 EXPLAINED = 0.7  # of the levels' variance, by a ramp or a jump
 WANDERING = (
     "loads that nobody measures, or an answer far from linear: the model is less exact, feedback corrects the rest; "
     "make a tag that measures such a load dv, and where you know of none check the tag and its times"
 )
-UNEXPLAINED = 0.3  # of the standard deviation of an integrator's change from block to block
-HALF = 0.5  # of the rows, that are judged at least
-RESTS = 2  # settling times, after which a free run has come to the plant's level
+UNEXPLAINED_CHANGE = 0.3  # of the standard deviation of an integrator's change from block to block
+JUDGED_ROWS = 0.5  # of the rows, that are judged at least
+FREE_RUN_SETTLINGS = 2  # settling times, after which a free run has come to the plant's level
 SPLITS = 40  # places tried for a jump
 SUDDEN = 0.6  # of a jump, within two blocks
 STANDS_OUT, MOST_BLOCKS = 2.5, 0.75  # times what levels change over two blocks elsewhere, but for another jump
@@ -135,16 +137,16 @@ class Levels:
 def levels_of(y: Array, expected: Array, span: float, settling: int) -> Levels | None:
     """Levels of y (n,) about ``expected`` (n,), for a plant that settles in so many rows; None of too few rows."""
     ok = np.flatnonzero(np.isfinite(y) & np.isfinite(expected))
-    length = max(BLOCK, min(settling, len(ok) // (2 * LEVELS)), len(ok) // MOST_LEVELS)
+    length = max(LEVEL_BLOCK, min(settling, len(ok) // (2 * FEWEST_LEVELS)), len(ok) // MOST_DRIFT_LEVELS)
     m = len(ok) // length
-    if m < LEVELS or span <= 0:
+    if m < FEWEST_LEVELS or span <= 0:
         return None
     rows = ok[: m * length].reshape(m, length)
     e = expected[rows].mean(axis=1)
     z = (e - e.mean()) / max(float(e.std()), 1e-300)
     noise = float(np.median(np.std(y[rows] - expected[rows], axis=1))) / np.sqrt(length)
     curve = np.column_stack([np.ones(m), z, z**2, z**3])
-    least = max(WANDERS * span, OF_NOISE * noise)
+    least = max(LEVEL_WANDERS * span, OF_MEAN_NOISE * noise)
     return Levels(y[rows].mean(axis=1) - e, e, z, curve, rows[:, 0], span, least)
 
 
@@ -181,8 +183,8 @@ def _wanders(y: Array, expected: Array, model: Linear, run: NDArray[np.int64]) -
     """Whether the levels of y (n,) wander about the free run, or the free run takes too long to tell."""
     settling = [model.settling(i) for i, strength in model.strength.items() if strength >= NO_EFFECT]
     begun = np.flatnonzero(np.diff(run, prepend=-1))[run]
-    reached = np.arange(len(y)) - begun >= RESTS * max(settling, default=0)
-    if not settling or 0 in settling or reached.mean() < HALF:
+    reached = np.arange(len(y)) - begun >= FREE_RUN_SETTLINGS * max(settling, default=0)
+    if not settling or 0 in settling or reached.mean() < JUDGED_ROWS:
         return True
     own = np.where(reached, expected, np.nan)
     return bool(of_levels("", y, own, float(np.ptp(usual(y))), max(settling)))
@@ -191,16 +193,16 @@ def _wanders(y: Array, expected: Array, model: Linear, run: NDArray[np.int64]) -
 def of_changes(name: str, y: Array, expected: Array, run: NDArray[np.int64]) -> list[Finding]:
     """One finding where the inputs leave much of the change of y (n,) from block to block to other causes."""
     ok = np.flatnonzero(np.isfinite(y) & np.isfinite(expected))
-    m = len(ok) // BLOCK
-    if m < LEVELS:
+    m = len(ok) // LEVEL_BLOCK
+    if m < FEWEST_LEVELS:
         return []
-    rows = ok[: m * BLOCK].reshape(m, BLOCK)
+    rows = ok[: m * LEVEL_BLOCK].reshape(m, LEVEL_BLOCK)
     same = run[rows[1:, -1]] == run[rows[:-1, 0]]
     change = np.diff(y[rows].mean(axis=1))[same]
     rest = change - np.diff(expected[rows].mean(axis=1))[same]
-    noise = float(np.median(np.std(y[rows] - expected[rows], axis=1))) * np.sqrt(2 / BLOCK)
+    noise = float(np.median(np.std(y[rows] - expected[rows], axis=1))) * np.sqrt(2 / LEVEL_BLOCK)
     share = float(rest.std() / max(float(change.std()), 1e-300))
-    if share < UNEXPLAINED or rest.std() < OF_NOISE * noise:
+    if share < UNEXPLAINED_CHANGE or rest.std() < OF_MEAN_NOISE * noise:
         return []
     words = f"integrates, and its inputs do not explain {100 * min(share, 1.0) ** 2:.0f} % of its changes; {WANDERING}"
     return [Finding("drift", name, words)]

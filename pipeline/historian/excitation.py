@@ -13,17 +13,18 @@ from loopwright.pipeline.historian.answers import first_answer
 from loopwright.pipeline.historian.arx_model import Linear
 from loopwright.pipeline.historian.cleaning.findings import InputReport, RecordJudgement, counted
 from loopwright.pipeline.historian.feedback import follows
+from loopwright.pipeline.historian.files.signal_statistics import HELD_ROWS
 from loopwright.pipeline.historian.settling import certain
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record
 from loopwright.serving.manifest import Signal
 
 # --------------------------------------------- power of an input against the plant's band, and its coherence with a PV
-SETTLINGS = 4  # of a segment
-SHORTEST, LONGEST = 64, 4096  # rows of a segment
+SEGMENT_SETTLINGS = 4  # of a segment
+SHORTEST_SEGMENT, LONGEST_SEGMENT = 64, 4096  # rows of a segment
 SEGMENTS = 4  # at least, for a coherence
-MOST = 60_000  # rows
-BAND = (0.1, 3.0)  # of the plant's corner frequency
+MOST_SPECTRUM_ROWS = 60_000  # rows
+PLANT_BAND = (0.1, 3.0)  # of the plant's corner frequency
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +40,7 @@ class Spectrum:
     frequency: Array
     power: Array  # (m,) of the input, sums to 1
     coherence: Array  # (m,)
-    band: tuple[float, float]  # [1/row] of the plant: BAND times the corner 3 / (2 pi settling)
+    band: tuple[float, float]  # [1/row] of the plant: PLANT_BAND times the corner 3 / (2 pi settling)
 
     @property
     def inside(self) -> NDArray[np.bool_]:
@@ -68,8 +69,8 @@ def spectra(u: Array, y: Array, run: NDArray[np.int64], settling: Sequence[int])
     """
     from scipy.signal import csd
 
-    n, m = min(len(u), MOST), u.shape[1]
-    length = int(np.clip(SETTLINGS * max(settling), SHORTEST, LONGEST))
+    n, m = min(len(u), MOST_SPECTRUM_ROWS), u.shape[1]
+    length = int(np.clip(SEGMENT_SETTLINGS * max(settling), SHORTEST_SEGMENT, LONGEST_SEGMENT))
     edges = np.r_[0, np.flatnonzero(np.diff(run[:n])) + 1, n]
     parts = [(int(a), int(b)) for a, b in pairwise(edges) if b - a >= length]
     if sum(2 * (b - a) // length - 1 for a, b in parts) < SEGMENTS + 2 * m:
@@ -96,7 +97,7 @@ def _of_input(frequency: Array, cross: NDArray[np.complex128], i: int, settling:
     inverse = np.linalg.inv(cross + ridge)
     square = np.abs(inverse[:, i, -1]) ** 2 / np.maximum(np.abs(inverse[:, i, i] * inverse[:, -1, -1]), 1e-300)
     corner = 3.0 / (2 * np.pi * max(settling, 1))
-    band = (BAND[0] * corner, min(BAND[1] * corner, 0.5))
+    band = (PLANT_BAND[0] * corner, min(PLANT_BAND[1] * corner, 0.5))
     return Spectrum(frequency, power / max(float(power.sum()), 1e-300), np.clip(square, 0.0, 1.0), band)
 
 
@@ -105,17 +106,16 @@ Runs = NDArray[np.int64]
 
 MOVE_SHARE = 0.02  # of an input's own span: a move that counts
 FEW_MOVES, ENOUGH_MOVES = 6, 20  # of an input: fewer are a question, and as many are wanted
-SEEN = 4.0  # strength of an answer
-FOLLOWS, FOLLOWS_CLOSELY = 0.15, 0.9  # share of the moves that the PVs' past explains
-ALIKE, THE_SAME = 0.9, 0.98  # correlation of two inputs
-NARROW = 0.05  # of an MV's range
+SEEN_STRENGTH = 4.0  # strength of an answer
+FEEDBACK_SHARE, FOLLOWS_CLOSELY = 0.15, 0.9  # share of the moves that the PVs' past explains
+ALIKE_INPUTS, SAME_INPUTS = 0.9, 0.98  # correlation of two inputs
+NARROW_MV = 0.05  # of an MV's range
 ROWS_A_PARAMETER, LEAST_ROWS_A_PARAMETER = 20, 4  # rows that are wanted, and below which there are too few
 IN_BAND = 0.1  # share of an input's power in the plant's band
-COHERENT = 0.3  # coherence in the band
+COHERENT_ANSWER = 0.3  # coherence in the band
 LONG_DELAY, LEAST_DELAY = 1.0, 20  # dead time over what follows it, and rows
 UNKNOWN_SETTLING = 30  # rows, where no answer is seen
 OUT_OF_RANGE = 0.1  # share of the rows dropped for it, from which the record is doubtful
-HELD = 0.6  # share of rows without a move, from which an input is moved in steps
 
 
 def moves_of(u: Array, run: Runs) -> Array:
@@ -128,7 +128,7 @@ def moves_of(u: Array, run: Runs) -> Array:
         return np.zeros(0)
     inside = run[1:] == run[:-1]
     step = np.diff(u)[inside]
-    if np.mean(np.abs(step) <= 1e-9 * span) >= HELD:
+    if np.mean(np.abs(step) <= 1e-9 * span) >= HELD_ROWS:
         return np.abs(step[np.abs(step) >= MOVE_SHARE * span])
     # Ends of a rise or fall; small reversals belong to it.
     sizes, pivot, extreme, way = [], float(u[0]), float(u[0]), 0
@@ -179,7 +179,7 @@ def judged(
 
 def _unsure(pv: str, model: Linear, inputs: list[InputReport]) -> bool:
     """Whether the gain and settling time of a PV that drifts may come from the drift, or from loads that wander."""
-    seen = [i for i in inputs if i.role == "mv" and i.answers[pv] > SEEN]
+    seen = [i for i in inputs if i.role == "mv" and i.answers[pv] > SEEN_STRENGTH]
     unconfirmed = bool(seen) and not model.integrates and not any(pv in i.certain for i in seen)
     return unconfirmed or not model.sure
 
@@ -205,7 +205,7 @@ def spectra_of(record: Record, models: Mapping[str, Linear | None]) -> dict[str,
     found = {}
     for (name, model), y in zip(models.items(), record.pv.T, strict=True):
         settling = [
-            (model.settling(i) if model and model.strength[i] > SEEN else 0) or UNKNOWN_SETTLING
+            (model.settling(i) if model and model.strength[i] > SEEN_STRENGTH else 0) or UNKNOWN_SETTLING
             for i in range(u.shape[1])
         ]
         own = spectra(u, y, record.run, settling)
@@ -231,10 +231,10 @@ def _input(
     held = float(np.mean(still))
     pvs = dict(zip((s.name for s in record.pv_signals), record.pv.T, strict=True))
     answers = {n: m.strength[i] if m else 0.0 for n, m in models.items()}
-    seen = {n: m for n, m in models.items() if m and answers[n] > SEEN}
+    seen = {n: m for n, m in models.items() if m and answers[n] > SEEN_STRENGTH}
     settling = {n: m.settling(i) for n, m in seen.items()}
     sure = tuple(n for n in settling if i in certain_of[n])
-    first = {n: first_answer(y, u, record.run) for n, y in pvs.items()} if held >= HELD else {}
+    first = {n: first_answer(y, u, record.run) for n, y in pvs.items()} if held >= HELD_ROWS else {}
     median, largest = (float(np.median(moves)), float(moves.max())) if moves.size else (0.0, 0.0)
     return InputReport(
         name=signal.name,
@@ -263,7 +263,7 @@ def _input(
 
 def _settling(model: Linear, n: int) -> dict[int, int]:
     """Rows in which the PV settles after each of n inputs that it answers to; 0 where it does not."""
-    return {i: model.settling(i) for i in range(n) if model.strength[i] > SEEN}
+    return {i: model.settling(i) for i in range(n) if model.strength[i] > SEEN_STRENGTH}
 
 
 def _gain(model: Linear, i: int) -> float:
@@ -289,17 +289,17 @@ def _reasons(
             found.append((1, f"{moved}; {ENOUGH_MOVES} are wanted"))
         if i.moves >= FEW_MOVES and not _answered(i):
             words = f"no process variable answers to {i.name}: check the tag, its times, and the PVs"
-            if any(s > FOLLOWS for s in i.follows.values()):
+            if any(s > FEEDBACK_SHARE for s in i.follows.values()):
                 words += f"; {i.name} answers to a PV instead: are the two swapped, or is it a controller's output"
             found.append((2, words))
         if i.against:
             words = "feedback, by hand or by a controller, and no late column; no doubt by itself"
             found.append((0, f"{i.name} is moved against what {', '.join(i.against)} did before: {words}"))
         found += _band_and_delay(i, record.period_s)
-        if 0 < span < NARROW * (i.high - i.low):
+        if 0 < span < NARROW_MV * (i.high - i.low):
             found.append((1, f"{i.name} moved over {100 * span / (i.high - i.low):.1f} % of its range"))
-        followed = {pv: s for pv, s in i.follows.items() if s > FOLLOWS}
-        if followed and i.held_share < HELD:
+        followed = {pv: s for pv, s in i.follows.items() if s > FEEDBACK_SHARE}
+        if followed and i.held_share < HELD_ROWS:
             pv, share = max(followed.items(), key=lambda item: item[1])
             words = f"{i.name} follows {pv} (feedback explains {100 * share:.0f} % of its moves)"
             alone = moved_sp < FEW_MOVES
@@ -309,14 +309,14 @@ def _reasons(
                 words += f", and {moved}: the record shows the controller more than the plant"
             found.append((2 if alone and share > FOLLOWS_CLOSELY else 1 if alone else 0, words))
     for pair, r in correlation.items():
-        if abs(r) > ALIKE:
-            end = ": their effects cannot be told apart" if abs(r) > THE_SAME else ""
-            found.append((2 if abs(r) > THE_SAME else 1, f"{pair} move together (correlation {r:.2f}){end}"))
+        if abs(r) > ALIKE_INPUTS:
+            end = ": their effects cannot be told apart" if abs(r) > SAME_INPUTS else ""
+            found.append((2 if abs(r) > SAME_INPUTS else 1, f"{pair} move together (correlation {r:.2f}){end}"))
     return [words for _, words in sorted(found, key=lambda f: -f[0])], max((level for level, _ in found), default=0)
 
 
 def _answered(i: InputReport) -> bool:
-    return any(a > SEEN for a in i.answers.values()) or bool(i.first_answer_s)
+    return any(a > SEEN_STRENGTH for a in i.answers.values()) or bool(i.first_answer_s)
 
 
 def _band_and_delay(i: InputReport, period_s: float) -> list[tuple[int, str]]:
@@ -324,7 +324,7 @@ def _band_and_delay(i: InputReport, period_s: float) -> list[tuple[int, str]]:
     if 0 <= i.band_share < IN_BAND:
         found.append((1, f"{i.name} moves slower or faster than the plant answers: {100 * i.band_share:.0f} % of its "
                          "motion lies in the plant's band"))  # fmt: skip
-    if i.coherence and _answered(i) and max(i.coherence.values()) < COHERENT:
+    if i.coherence and _answered(i) and max(i.coherence.values()) < COHERENT_ANSWER:
         pv, share = max(i.coherence.items(), key=lambda item: item[1])
         found.append((1, f"{pv} owes {100 * share:.0f} % of its motion to {i.name} (coherence in the plant's band): "
                          "noise, other causes, or a strong nonlinearity"))  # fmt: skip

@@ -16,13 +16,13 @@ from loopwright.pipeline.metrics import Array
 Runs = NDArray[np.int64]
 
 OWN, SEEN_ROWS = 3, 3  # rows of an MV's own past, and of a PV's, that explain its moves
-MOST_ROWS = 60_000  # rows: from twice as many on every second is taken; more cost time and decide nothing
-SURE = 10.0  # F of a share, below which it is chance
-LATER = (5, 30)  # rows after a move over which the plant's answer is told from the controller's
-CERTAIN = 2.0  # standard deviations of that answer
+MOST_FEEDBACK_ROWS = 60_000  # rows: from twice as many on every second is taken; more cost time and decide nothing
+FEEDBACK_F = 10.0  # F of a share, below which it is chance
+PLANT_ANSWER_ROWS = (5, 30)  # rows after a move over which the plant's answer is told from the controller's
+PLANT_ANSWER_SDS = 2.0  # standard deviations of that answer
 INTEGRAL = 0.7  # weight of u's past in u(k), of which an integral has 1
 CLIPPED = 5.0  # typical moves beyond which a move counts as this one: set points and hands move by far more
-STANDS, LEAST_MOVING = 20, 0.1  # rows of one value of an MV that stands; share of the rows in which it has to move
+STANDING, LEAST_MOVING = 20, 0.1  # rows of one value of an MV that stands; share of the rows in which it has to move
 FED_BACK = 0.1  # share of the clipped moves that the PVs' past explains
 
 
@@ -61,10 +61,10 @@ def fed_back(u: Array, y: Array, run: Runs) -> bool:
 
 
 def _stands(u: Array, run: Runs) -> NDArray[np.bool_]:
-    """Rows (n,) of an MV u (n,) that keeps its value for ``STANDS`` rows or more."""
+    """Rows (n,) of an MV u (n,) that keeps its value for ``STANDING`` rows or more."""
     changes = np.r_[True, (np.diff(u) != 0) | (np.diff(run) != 0)]
     piece = np.cumsum(changes) - 1
-    return np.asarray(np.bincount(piece)[piece] >= STANDS)
+    return np.asarray(np.bincount(piece)[piece] >= STANDING)
 
 
 def _read(u: Array, y: Array, run: Runs) -> tuple[Array, Array, Runs]:
@@ -78,7 +78,7 @@ def _shares(move: Array, u: Array, y: Array, run: Runs) -> tuple[float, float]:
     back = max(OWN, SEEN_ROWS) + 1
     k = np.arange(back, len(u))
     k = k[run[k] == run[k - back]]
-    k = k[:: max(1, len(k) // MOST_ROWS)]
+    k = k[:: max(1, len(k) // MOST_FEEDBACK_ROWS)]
     if len(k) < 60:
         return 0.0, 0.0
     own = np.column_stack([u[k - 1], *(u[k - i] - u[k - i - 1] for i in range(1, OWN)), np.ones(len(k))])
@@ -90,7 +90,7 @@ def _shares(move: Array, u: Array, y: Array, run: Runs) -> tuple[float, float]:
         seen = np.column_stack([own, *(y[k - i] for i in range(first, first + SEEN_ROWS))])
         share = 1.0 - _rest(seen, move[k]) / total
         f = share * (len(k) - seen.shape[1]) / max(1 - share, 1e-9) / SEEN_ROWS
-        found.append(float(share) if f > SURE else 0.0)
+        found.append(float(share) if f > FEEDBACK_F else 0.0)
     return found[0], found[1]
 
 
@@ -103,8 +103,8 @@ def _opposes(u: Array, y: Array, run: Runs) -> bool:
     k = k[run[k] == run[k - OWN - 1]]
     past = np.column_stack([*(z[k - i] for z in (u, y) for i in range(1, OWN + 1)), np.ones(len(k))])
     model = DirectModel.of(y, u[:, None], run)
-    answer, sd = (0.0, 1.0) if model is None else model.answer(0, *LATER)
-    if abs(answer) > CERTAIN * sd:
+    answer, sd = (0.0, 1.0) if model is None else model.answer(0, *PLANT_ANSWER_ROWS)
+    if abs(answer) > PLANT_ANSWER_SDS * sd:
         both = np.column_stack([u[k], y[k]])
         left = both - past @ np.linalg.lstsq(past, both, rcond=1e-10)[0]
         return bool(float(left[:, 0] @ left[:, 1]) * answer < 0)

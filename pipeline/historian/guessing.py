@@ -17,7 +17,7 @@ from loopwright.pipeline.historian.cleaning.row_grid import resampled
 from loopwright.pipeline.historian.cleaning.sampling import proposed_period
 from loopwright.pipeline.historian.cleaning.tag_checks import sentinels
 from loopwright.pipeline.historian.cleaning.tags import GUESSED_PAD, NO_LOOP, Guess, Look, Tag, automatic, by_hand
-from loopwright.pipeline.historian.excitation import FEW_MOVES, FOLLOWS, SEEN, moves_of
+from loopwright.pipeline.historian.excitation import FEEDBACK_SHARE, FEW_MOVES, SEEN_STRENGTH, moves_of
 from loopwright.pipeline.historian.feedback import follows
 from loopwright.pipeline.historian.files.export import Export, Series
 from loopwright.pipeline.historian.files.quality import Reason
@@ -66,8 +66,8 @@ LABEL = re.compile(
 )
 HELD_SHARE = 0.9  # of the readings equal to the one before: moved in steps
 LEAST_GOOD = 0.5  # share of the readings of a tag that is tried as a disturbance
-MOST_TRIED, MOST_READINGS = 60, 20_000  # tags whose role is guessed, and readings of each
-STRONG = 25.0  # strength of an answer, as SEEN of excitation, for a guess
+MOST_GUESSED_TAGS, MOST_GUESSED_READINGS = 60, 20_000  # tags whose role is guessed, and readings of each
+GUESS_STRENGTH = 25.0  # strength of an answer, as SEEN_STRENGTH of excitation, for a guess
 LOOP = re.compile(r"^(?P<loop>.*?)[ ._:/-]+[A-Za-z ]+$")
 
 
@@ -205,7 +205,7 @@ def without_answers(found: Sequence[Guess], export: Export) -> list[Guess]:
 def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
     """Whether y (n,) answers to one of the inputs u, (n,) each, by the quick model or by what follows their moves."""
     model = fit_arx(y, list(u), run)
-    seen = model is not None and max(model.strength[i] for i in range(len(u))) > SEEN
+    seen = model is not None and max(model.strength[i] for i in range(len(u))) > SEEN_STRENGTH
     return seen or any(first_answer(y, v, run) is not None for v in u)
 
 
@@ -235,29 +235,29 @@ def disturbances(found: Sequence[Guess], export: Export, taken: Collection[str] 
     free = [tag for tag in free if tag not in taken and tag not in labels]
     if not pvs or not mvs or not free:
         return list(found)
-    roles = dict.fromkeys(pvs, "pv") | dict.fromkeys(mvs, "mv") | dict.fromkeys(free[:MOST_TRIED], "dv")
+    roles = dict.fromkeys(pvs, "pv") | dict.fromkeys(mvs, "mv") | dict.fromkeys(free[:MOST_GUESSED_TAGS], "dv")
     own = {name: _excerpt(export.series[name], role) for name, role in roles.items()}
     grid, _ = resampled(
-        [own[n] for n in (*pvs, *free[:MOST_TRIED])], [own[n] for n in mvs], proposed_period([own[pvs[0]]])
+        [own[n] for n in (*pvs, *free[:MOST_GUESSED_TAGS])], [own[n] for n in mvs], proposed_period([own[pvs[0]]])
     )
     # A flow through an MV's valve is an answer to the MV, and no cause of its own.
-    moved = {n: fit_arx(grid.value[n], [grid.value[m] for m in mvs], grid.piece) for n in free[:MOST_TRIED]}
-    consequences = {n for n, model in moved.items() if model and max(model.strength.values()) > STRONG}
+    moved = {n: fit_arx(grid.value[n], [grid.value[m] for m in mvs], grid.piece) for n in free[:MOST_GUESSED_TAGS]}
+    consequences = {n for n, model in moved.items() if model and max(model.strength.values()) > GUESS_STRENGTH}
     causes: dict[str, str] = {}
     for pv in pvs:
         y = grid.value[pv]
-        for name in free[:MOST_TRIED]:
+        for name in free[:MOST_GUESSED_TAGS]:
             u = [*(grid.value[m] for m in mvs), grid.value[name]]
             model = fit_arx(y, u, grid.piece)
-            seen = model is not None and model.strength[len(mvs)] > STRONG and name not in consequences
-            if seen and follows(grid.value[name], y, grid.piece) < FOLLOWS and name not in causes:
+            seen = model is not None and model.strength[len(mvs)] > GUESS_STRENGTH and name not in consequences
+            if seen and follows(grid.value[name], y, grid.piece) < FEEDBACK_SHARE and name not in causes:
                 causes[name] = pv
     return [g.as_role("dv", f"guessed: {causes[g.tag.tag]} answers") if g.tag.tag in causes else g for g in found]
 
 
 def _excerpt(series: Series, role: str) -> Series:
     """The first readings of a tag, those without a reason; codes for missing values left out."""
-    n = min(len(series), MOST_READINGS)
+    n = min(len(series), MOST_GUESSED_READINGS)
     value, code = series.value[:n].copy(), series.code[:n].copy()
     codes, _ = sentinels(np.where(code == Reason.GOOD, value, np.nan), Tag(series.tag, role))
     code[codes & (code == Reason.GOOD)] = Reason.SENTINEL

@@ -15,9 +15,8 @@ from loopwright.pipeline.historian.cleaning.row_grid import Grid
 from loopwright.pipeline.historian.cleaning.sampling import TagSampling, sampling, whole_multiple
 from loopwright.pipeline.historian.cleaning.tag_checks import VALVE_RANGE
 from loopwright.pipeline.historian.cleaning.tags import SIGNAL_ROLES, Tag
-from loopwright.pipeline.historian.excitation import HELD
 from loopwright.pipeline.historian.files.export import Export, Series
-from loopwright.pipeline.historian.files.signal_statistics import quantum, staircase, straight_share
+from loopwright.pipeline.historian.files.signal_statistics import HELD_ROWS, quantum, staircase, straight_share
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record, levels_of, only_between
 
@@ -62,11 +61,12 @@ def _near(levels: Sequence[float], ends: Sequence[float]) -> bool:
 
 
 # --------------------------------------------------------------------------------------------------------- all notices
-COARSE = 0.002  # of the usual span: a converter's step that a model feels
+COARSE_STEP = 0.002  # of the usual span: a converter's step that a model feels
 STRAIGHT = 0.3  # share of rows in straight lines, from which a signal was compressed
 BRIDGED = 0.05  # of the rows, drawn or held because no reading is near
-ELSEWHERE = 0.1  # readings of other files for each row of the file that lacks the tag: stored apart, by exception
-AHEAD = 25.0  # strength of moves still to come
+# readings of other files for each row of the file that lacks the tag: stored apart, by exception
+READINGS_ELSEWHERE = 0.1
+MOVES_AHEAD = 25.0  # strength of moves still to come
 
 
 def of_series(series: Series, rate: TagSampling, role: str, period_s: float) -> list[Finding]:
@@ -100,7 +100,7 @@ def of_series(series: Series, rate: TagSampling, role: str, period_s: float) -> 
         words += f"; give --period {made_s:.6g}" if period_s < 0.99 * made_s else f"; the rows are of {period_s:.6g} s"
         found.append(Finding("repeated", series.tag, words))
     step = quantum(values)
-    if span > 0 and step > COARSE * span and role in {"pv", "dv"}:  # an MV is moved in steps
+    if span > 0 and step > COARSE_STEP * span and role in {"pv", "dv"}:  # an MV is moved in steps
         noise = noise_sd(values)
         words = f"moves in steps of {step:.4g}, {100 * step / span:.2g} % of its span"
         words += ", more than its noise" if step > 2 * noise else ""
@@ -136,7 +136,7 @@ def of_files(export: Export, tags: Sequence[Tag]) -> list[Finding]:
         times = export.series[tag].time_s
         for file in (f for f in export.contents if tag not in f.tags and f.rows):
             inside = np.count_nonzero((times >= file.first_s) & (times <= file.last_s))
-            if inside < ELSEWHERE * file.rows:
+            if inside < READINGS_ELSEWHERE * file.rows:
                 role = next(t.role for t in tags if t.tag == tag)
                 end = f": its {file.rows} rows are left out" if role in SIGNAL_ROLES else ""
                 found.append(Finding("lacking", tag, f"{file.path} has no {tag}{end}", bool(end)))
@@ -174,14 +174,14 @@ def of_models(record: Record, models: Mapping[str, Linear | None]) -> list[Findi
     for i, signal in enumerate(record.mv_signals):
         span = max(float(np.ptp(record.mv[:, i])), 1e-300)
         held = float(np.mean(np.abs(np.diff(record.mv[:, i])) <= 1e-9 * span))
-        if held < HELD:  # in a loop the MV follows the PV at every row; an MV that holds does not know what comes
+        if held < HELD_ROWS:  # in a loop the MV follows the PV at every row; an MV that holds does not know what comes
             continue
         leads = {
             name: lead(m, y, inputs, i)
             for (name, m), y in zip(models.items(), record.pv.T, strict=True)
             if m is not None
         }
-        early = {name: rows for name, (strength, rows) in leads.items() if strength > AHEAD}
+        early = {name: rows for name, (strength, rows) in leads.items() if strength > MOVES_AHEAD}
         if early:
             answers = {
                 n: first_answer(y, record.mv[:, i], record.run) for n, y in zip(models, record.pv.T, strict=True)

@@ -116,18 +116,20 @@ def operated(
 
 
 # ----------------------------------------------------------- the PI, identified from set point, PV and MV in automatic
-WINDOWS = (600, 200, 60, 20)  # rows
-LEAST_WINDOWS = 12  # of a length, or too few are left to fit, to choose and to score
+LOOP_WINDOWS = (600, 200, 60, 20)  # rows
+LEAST_LOOP_WINDOWS = 12  # of a length, or too few are left to fit, to choose and to score
 FEWEST_ASKED = 2  # windows with a moving set point that count by themselves
-LATE = (0, 1)  # rows: in some exports the PV of a row is what the MV of that row made
+LATE_PV_ROWS = (0, 1)  # rows: in some exports the PV of a row is what the MV of that row made
 FIT, CHOICE, SCORE = range(3)  # what every third window is for
-ROUNDS = 8  # of leaving out windows in which something else moved the MV
-FAR = 9.0  # times the median squared error, beyond which a window is left out of the fit
-AT_END = 1e-3  # of the MV's range: at a limit the law is another
+LEAVING_OUT_ROUNDS = 8  # of leaving out windows in which something else moved the MV
+FAR_WINDOW = 9.0  # times the median squared error, beyond which a window is left out of the fit
+AT_MV_LIMIT = 1e-3  # of the MV's range: at a limit the law is another
 MOST_AT_END = 0.1  # of a window's rows
-REST, RESTS = 10, 10.0  # rows, and times the usual rest: one MV that rests longer is in manual, where no mode tells
+# rows, and times the usual rest: one MV that rests longer is in manual, where no mode tells
+MANUAL_REST, MANUAL_RESTS = 10, 10.0
 BELIEVED = 0.8  # least share; hand operation and cascades stay below
-BETTER = 0.5  # of the unexplained share: a further part or a shorter window must leave less, and no integral part more
+# of the unexplained share: a further part or a shorter window must leave less, and no integral part more
+BETTER_LOOP_FIT = 0.5
 
 _P_ON_PV, _P_ON_SP, _I, _D = np.eye(4)
 _P_ON_ERROR = _P_ON_PV + _P_ON_SP
@@ -154,7 +156,7 @@ class LoopWindows:
     @property
     def enough(self) -> bool:
         """Whether each third of them can tell."""
-        return len(self.moved) >= LEAST_WINDOWS
+        return len(self.moved) >= LEAST_LOOP_WINDOWS
 
     def taken(self, use: int) -> LoopWindows:
         """Every third window."""
@@ -186,13 +188,13 @@ class LoopWindows:
         mixed = np.stack(basis, axis=-1)
         moved, parts = self.moved / size, self.parts @ mixed / size[..., None]
         kept, numbers = np.ones(len(moved), dtype=bool), np.zeros(4)
-        for _ in range(ROUNDS):
+        for _ in range(LEAVING_OUT_ROUNDS):
             scale = np.sqrt(np.mean(parts[kept] ** 2, axis=(0, 1)))
             scale[scale == 0] = 1.0
             flat = (parts[kept] / scale).reshape(-1, len(basis))
             numbers = mixed @ (np.linalg.lstsq(flat, moved[kept].ravel(), rcond=1e-10)[0] / scale)
             errors = self.errors(numbers) / size[:, 0] ** 2
-            now = errors <= FAR * np.median(errors)
+            now = errors <= FAR_WINDOW * np.median(errors)
             if np.array_equal(now, kept):
                 break
             kept = now
@@ -225,7 +227,7 @@ class FittedForm:
 
     def betters(self, other: FittedForm | None) -> bool:
         """Whether it leaves by far less than a plainer one; one that is not sound betters none."""
-        return other is None or (self.sound and self.unexplained < BETTER * other.unexplained)
+        return other is None or (self.sound and self.unexplained < BETTER_LOOP_FIT * other.unexplained)
 
     @property
     def sound(self) -> bool:
@@ -239,7 +241,7 @@ class FittedForm:
         rest = [part for part in self.basis if part is not _I]
         without = self.windows.taken(FIT).fitted(rest)
         score = self.windows.taken(SCORE)
-        return score.unexplained(self.numbers) < BETTER * score.unexplained(without)
+        return score.unexplained(self.numbers) < BETTER_LOOP_FIT * score.unexplained(without)
 
 
 def old_controllers(
@@ -266,8 +268,8 @@ def identified(grid: Grid, loop: LoopRows, mv: Tag) -> OldController:
     if loop.manual:
         return _unknown(loop, mv, "the loop was in manual in all rows")
     best: FittedForm | None = None
-    for length in WINDOWS:
-        late = [(n, w) for n in LATE if (w := _windows(rows, piece, grid.period_s, length, n, mv)).enough]
+    for length in LOOP_WINDOWS:
+        late = [(n, w) for n in LATE_PV_ROWS if (w := _windows(rows, piece, grid.period_s, length, n, mv)).enough]
         own: FittedForm | None = None
         for forms in FORMS if late else ():
             one = min((FittedForm.of(w, form, n) for form in forms for n, w in late), key=lambda f: f.unexplained)
@@ -315,7 +317,7 @@ def _without_rests(op: Array, piece: NDArray[np.int64]) -> NDArray[np.int64]:
     """The pieces (n,), cut up where an MV (n,) that moves at most rows rests: each such row is one of its own."""
     begins = np.flatnonzero(np.r_[True, (np.diff(op) != 0) | (np.diff(piece) != 0)])
     rests = np.diff(np.append(begins, len(op)))
-    long = np.repeat(rests > max(REST, RESTS * float(np.median(rests))), rests)
+    long = np.repeat(rests > max(MANUAL_REST, MANUAL_RESTS * float(np.median(rests))), rests)
     return np.asarray(np.cumsum(np.r_[True, (np.diff(piece) != 0) | long[1:] | long[:-1]]), dtype=np.int64)
 
 
@@ -326,12 +328,12 @@ def _windows(
     sp, pv, op = rows
     begins = np.flatnonzero(np.r_[True, np.diff(piece) != 0])
     ends = np.append(begins[1:], len(piece))
-    first = 1 + max(LATE)  # the parts of the first row look back so far
+    first = 1 + max(LATE_PV_ROWS)  # the parts of the first row look back so far
     starts = np.concatenate([np.arange(b + first, e - length, length) for b, e in zip(begins, ends, strict=True)])
     at = starts.astype(np.int64)[:, None] + np.arange(length)
     low = max(float(np.nanmin(op)), -np.inf if mv.low is None else mv.low)
     high = min(float(np.nanmax(op)), np.inf if mv.high is None else mv.high)
-    slack = AT_END * (high - low)
+    slack = AT_MV_LIMIT * (high - low)
     moved = op[at]
     ended = ((moved <= low + slack) | (moved >= high - slack)).mean(axis=1)
     at = at[(np.ptp(moved, axis=1) > 0) & (ended <= MOST_AT_END) & np.isfinite(moved + pv[at] + sp[at]).all(axis=1)]

@@ -17,10 +17,10 @@ from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.metrics import Array
 
 # -------------------------------------------------------------- single readings of an MV that the plant never received
-FEWEST, MOST_SHARE = 3, 0.03  # pulses, and share of the rows
-SIZE = 0.05  # of the MV's span
+FEWEST_PULSES, MOST_PULSE_SHARE = 3, 0.03  # pulses, and share of the rows
+PULSE_SIZE = 0.05  # of the MV's span
 CLEARER = 20.0  # n log of the ratio of the residuals' variances, from which a PV says that there was no pulse
-OUTSIDE = 6.0  # standard deviations, beyond which a residual counts no more
+OUTSIDE_SDS = 6.0  # standard deviations, beyond which a residual counts no more
 
 
 def remove_pulses(grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag]) -> list[Finding]:
@@ -33,7 +33,7 @@ def remove_pulses(grid: Grid, own: Mapping[str, Series], signals: Sequence[Tag])
     for tag in (t for t in signals if t.role == "mv"):
         u = grid.value[tag.tag]
         rows = _pulses(u, grid.piece)
-        if not FEWEST <= len(rows) <= MOST_SHARE * len(u):
+        if not FEWEST_PULSES <= len(rows) <= MOST_PULSE_SHARE * len(u):
             continue
         plain = u.copy()
         plain[rows] = u[rows - 1]
@@ -67,23 +67,23 @@ def _pulses(u: Array, piece: NDArray[np.int64]) -> NDArray[np.int64]:
     low, high = np.nanquantile(u[:: max(1, len(u) // 200_000)], [0.01, 0.99])
     # Slices in place of lists of rows: a long record has room for one more column, not for six.
     away = (u[2:] == u[:-2]) & (piece[2:] == piece[:-2])
-    away &= np.abs(u[1:-1] - u[:-2]) > SIZE * (high - low)
+    away &= np.abs(u[1:-1] - u[:-2]) > PULSE_SIZE * (high - low)
     away &= u[1:-1] != u[:-2]
     return np.flatnonzero(away) + 1
 
 
 def _left(model: Linear, sd: float) -> float:
-    """Mean square of the residual, none counted beyond OUTSIDE."""
-    return float(np.mean(np.minimum(np.abs(model.residual), OUTSIDE * sd) ** 2))
+    """Mean square of the residual, none counted beyond OUTSIDE_SDS."""
+    return float(np.mean(np.minimum(np.abs(model.residual), OUTSIDE_SDS * sd) ** 2))
 
 
 # ----------------------------------------------------------------------------------------------------- readings of PVs
 CONFIRM_SD = 5.0  # residual of the model below which an outlier is an answer
 ERROR_SD = 8.0  # size of a measurement's error, in standard deviations of its estimate
 ERROR_SPAN = 0.01  # of the PV's span
-BETTER = 0.4  # what an error of one measurement leaves unexplained, over what a jump of the plant leaves
+ERROR_OVER_JUMP = 0.4  # what an error of one measurement leaves unexplained, over what a jump of the plant leaves
 SLOWEST = 0.7  # step of the readings over the period, from which a row is a reading
-CHUNK = 200_000  # rows
+REVIEW_CHUNK = 200_000  # rows
 
 
 def review_outliers(
@@ -125,7 +125,7 @@ def _answers(grid: Grid, series: Series, model: Linear, y: Array, u: Sequence[Ar
     row, bad = row[ok], bad[ok]
     if not bad.size:
         return 0
-    parts = np.split(row, np.searchsorted(row, np.arange(CHUNK, len(y), CHUNK)))
+    parts = np.split(row, np.searchsorted(row, np.arange(REVIEW_CHUNK, len(y), REVIEW_CHUNK)))
     expected = np.concatenate([model.predicted(y, u, part - 1) for part in parts if part.size])
     explained = np.abs(series.value[bad] - expected) < CONFIRM_SD * model.sd
     row, bad = row[explained], bad[explained]
@@ -146,19 +146,19 @@ def _errors(model: Linear, y: Array, u: Sequence[Array], piece: NDArray[np.int64
     """
     p = np.r_[1.0, -model.a]
     norm = float(p @ p)
-    low, high = np.nanquantile(y[:: max(1, len(y) // CHUNK)], [0.01, 0.99])
+    low, high = np.nanquantile(y[:: max(1, len(y) // REVIEW_CHUNK)], [0.01, 0.99])
     least = max(ERROR_SD * model.sd / np.sqrt(norm), ERROR_SPAN * float(high - low))
     found = []
     first = model.blocks[-1][1] + 1
-    for start in range(first, len(y) - len(p), CHUNK):
-        k = np.arange(start, min(start + CHUNK, len(y) - len(p)))
+    for start in range(first, len(y) - len(p), REVIEW_CHUNK):
+        k = np.arange(start, min(start + REVIEW_CHUNK, len(y) - len(p)))
         reach = np.arange(k[0], k[-1] + len(p))
         e = y[reach] - model.predicted(y, u, reach - 1)
         window = np.lib.stride_tricks.sliding_window_view(e, len(p))
         d = window @ p / norm
         total = np.einsum("ij,ij->i", window, window)
         with np.errstate(invalid="ignore"):
-            error = (np.abs(d) > least) & (total - norm * d**2 < BETTER * (total - window[:, 0] ** 2))
+            error = (np.abs(d) > least) & (total - norm * d**2 < ERROR_OVER_JUMP * (total - window[:, 0] ** 2))
         error &= piece[k - first] == piece[k + len(p) - 1]
         found.append(k[error])
     rows = np.concatenate(found) if found else np.zeros(0, dtype=np.int64)

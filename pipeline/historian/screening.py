@@ -34,7 +34,7 @@ from loopwright.pipeline.historian.cleaning.sampling import TagSampling, propose
 from loopwright.pipeline.historian.cleaning.tag_checks import flag_bad_readings, reasons_of, with_texts_of_one_side
 from loopwright.pipeline.historian.cleaning.tags import Tag, commanded_range
 from loopwright.pipeline.historian.drift import explained, of_levels, of_quick_models
-from loopwright.pipeline.historian.excitation import SEEN, judged, moves_of, with_rows_out_of_range
+from loopwright.pipeline.historian.excitation import SEEN_STRENGTH, judged, moves_of, with_rows_out_of_range
 from loopwright.pipeline.historian.files.export import Export, Series
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import quantum
@@ -66,7 +66,7 @@ def findings_of_answers(pvs: Sequence[str], verdict: RecordJudgement) -> list[Fi
     Empty where no PV answers at all: then the verdict says what is wrong with the MVs. ``pvs`` are names, in order.
     """
     mvs = [i for i in verdict.inputs if i.role == "mv"]
-    unmoved = [n for n in pvs if not any(i.answers.get(n, 0.0) > SEEN or n in i.first_answer_s for i in mvs)]
+    unmoved = [n for n in pvs if not any(i.answers.get(n, 0.0) > SEEN_STRENGTH or n in i.first_answer_s for i in mvs)]
     found = []
     if len(unmoved) < len(pvs):
         found += [Finding("unmoved", n, "answers to no MV: leave its role empty, or make it dv") for n in unmoved]
@@ -81,7 +81,7 @@ def findings_of_answers(pvs: Sequence[str], verdict: RecordJudgement) -> list[Fi
 
 
 # ------------------------------------------------------------------------------------------------- the whole screening
-LARGE = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures
+LARGE_TAG = 1_000_000  # readings of a tag, of which only the remarkable ones are kept for the pictures
 
 
 @dataclass(slots=True, eq=False)
@@ -145,7 +145,7 @@ def screen_export(
     def let_go(tag: str) -> None:
         """Count the readings of a tag; nothing but pictures needs them from here on."""
         counts_of[tag] = own[tag].counts()
-        if len(own[tag]) > LARGE:
+        if len(own[tag]) > LARGE_TAG:
             own[tag].lighten()
 
     def resampled_one(tag: str) -> None:

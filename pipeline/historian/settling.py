@@ -22,14 +22,14 @@ from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.metrics import Array
 
 # ---------------------------------------- a finite impulse response beside the model, whose noise has poles of its own
-WIDER = 1.25  # by which a block of lags is longer than the one before
-FOLLOWED = 2.0  # settling times, over which the answer is followed
-KNOWN = 0.06  # of the answer's end: its standard deviation, from which on it is not known where it settles
+FIR_BLOCK_GROWTH = 1.25  # by which a block of lags is longer than the one before
+FOLLOWED_SETTLINGS = 2.0  # settling times, over which the answer is followed
+END_UNCERTAIN = 0.06  # of the answer's end: its standard deviation, from which on it is not known where it settles
 RESPONSES_AGREE = 1.6  # ratio of two settling times that are the same, blocks of lags being as wide as they are
-WITHIN = 0.1  # of the end, as `Linear.settling`
+SETTLED_WITHIN = 0.1  # of the end, as `Linear.settling`
 ROWS_A_LAG = 4  # rows of the fit for each of its coefficients, at least
-RAMP, GROWS = 60, 1.3  # rows over which a ramp is followed, and its end over the middle
-MOST_ROWS = 24_000  # rows of a fit, the first ones: more cost time and hardly change it
+RAMP_ROWS, RAMP_GROWTH = 60, 1.3  # rows over which a ramp is followed, and its end over the middle
+MOST_FIR_ROWS = 24_000  # rows of a fit, the first ones: more cost time and hardly change it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,13 +42,13 @@ class StepAnswer:
 
     @property
     def known(self) -> bool:
-        """Whether the end is certain to a share KNOWN of itself."""
-        return bool(self.sd[-1] <= KNOWN * abs(self.value[-1]))
+        """Whether the end is certain to a share END_UNCERTAIN of itself."""
+        return bool(self.sd[-1] <= END_UNCERTAIN * abs(self.value[-1]))
 
     @property
     def settles(self) -> int:
-        """Rows after which the answer stays within WITHIN of its end, as far as the errors tell."""
-        outside = np.abs(self.value - self.value[-1]) > WITHIN * abs(self.value[-1]) + self.sd
+        """Rows after which the answer stays within SETTLED_WITHIN of its end, as far as the errors tell."""
+        outside = np.abs(self.value - self.value[-1]) > SETTLED_WITHIN * abs(self.value[-1]) + self.sd
         return int(self.lag[np.flatnonzero(outside)[-1] + 1]) if outside.any() else int(self.lag[0])
 
 
@@ -88,7 +88,7 @@ def certain(y: Array, u: Sequence[Array], run: NDArray[np.int64], settling: Mapp
     """
     lengths: dict[int, list[int]] = {}
     for i, rows in settling.items():
-        lengths.setdefault(_blocks(int(np.ceil(FOLLOWED * rows)))[-1][1], []).append(i)
+        lengths.setdefault(_blocks(int(np.ceil(FOLLOWED_SETTLINGS * rows)))[-1][1], []).append(i)
     found = set()
     for length, inputs in lengths.items():
         answers = step_answers(y, u, run, length)
@@ -104,18 +104,18 @@ def _agree(one: int, other: int) -> bool:
 
 def grows(y: Array, u: Sequence[Array], run: NDArray[np.int64], i: int) -> bool:
     """Whether y (n,) goes on and on after a step of input ``i``, for certain."""
-    answers = step_answers(y, u, run, RAMP)
+    answers = step_answers(y, u, run, RAMP_ROWS)
     if answers is None or not (found := answers[i]).known:
         return False
     middle = int(np.searchsorted(found.lag, found.lag[-1] / 2))
-    return bool(abs(found.value[-1]) > GROWS * abs(found.value[middle]))
+    return bool(abs(found.value[-1]) > RAMP_GROWTH * abs(found.value[middle]))
 
 
 def _blocks(length: int) -> list[tuple[int, int]]:
     """Lags first .. last-1 that share a coefficient, from 0 to ``length`` or a little more."""
     ends = [0, 1]
     while ends[-1] < length:
-        ends.append(max(ends[-1] + 1, int(WIDER * ends[-1])))
+        ends.append(max(ends[-1] + 1, int(FIR_BLOCK_GROWTH * ends[-1])))
     return list(pairwise(ends))
 
 
@@ -124,7 +124,7 @@ def _rows(y: Array, run: NDArray[np.int64], back: int) -> NDArray[np.int64]:
     k = np.arange(back, len(y) - 1)
     missing = np.r_[0, np.cumsum(~np.isfinite(y))]
     k = k[(run[k - back] == run[k + 1]) & (missing[k + 2] == missing[k - COLOUR])]
-    return k[:MOST_ROWS]
+    return k[:MOST_FIR_ROWS]
 
 
 def _fit(dy: Array, du: Sequence[Array], k: NDArray[np.int64], blocks: list[tuple[int, int]]) -> tuple[Array, Array]:
@@ -140,19 +140,21 @@ def _answer(du: Sequence[Array], theta: Array, k: NDArray[np.int64], blocks: lis
 
 
 # ------------------------------------------------------------------- settling time and period, by readings of any rate
-MOST_PERIODS, WANTED, LEAST_PERIODS = 60, 40, 28  # in which a plant settles: the longest look ahead, and what is usual
-FINE = 240  # periods up to which an export keeps its step, where its rows as they are show the settling
+
+# in which a plant settles: the longest look ahead, and what is usual
+MOST_PERIODS, WANTED_PERIODS, LEAST_PERIODS = 60, 40, 28
+FINE_EXPORT = 240  # periods up to which an export keeps its step, where its rows as they are show the settling
 FAST, A_HOLD = 4, 3  # periods that the fastest answer, and a hold of an MV, still have
 FACTORS = (1, 3, 10, 30, 100, 300, 1000)  # by which the rows are thinned out
-LEAST_ROWS = 200  # of a fit
+LEAST_FIT_ROWS = 200  # of a fit
 RESOLVED = 8  # rows from which an answer's settling is known well enough
 AGREES = 1.3  # ratio of two settling times that are the same
-CLEAR = 10.0  # strength of an answer
+CLEAR_ANSWER = 10.0  # strength of an answer
 A_PART = 0.1  # of what the largest answer of a PV is: smaller ones do not count
-MOST_SHARE = 0.2  # of the rows, up to which an answer's settling is believed
-STEADY = 0.9  # share of its slope that an answer keeps which goes on and on
-LINE, LATE = (41, 120), 3  # rows between which a ramp's line is laid, and how often its lateness is taken
-MOVE = 0.02  # of an MV's span
+MOST_SETTLING_SHARE = 0.2  # of the rows, up to which an answer's settling is believed
+RAMP_SLOPE_KEPT = 0.9  # share of its slope that an answer keeps which goes on and on
+RAMP_LINE, LATENESS = (41, 120), 3  # rows between which a ramp's line is laid, and how often its lateness is taken
+MV_MOVE = 0.02  # of an MV's span
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,22 +185,22 @@ class Pace:
         return max(self.answers, key=lambda a: a.settles_s, default=None)
 
     def suits(self, step_s: float) -> bool:
-        """Whether rows of step_s [s] show how the plant settles, and it does in some MOST_PERIODS, or at most FINE."""
+        """Whether rows of step_s [s] show how the plant settles, in some MOST_PERIODS, or at most FINE_EXPORT."""
         slowest = self.slowest
-        return slowest is None or slowest.settles_s <= (FINE if slowest.shown else MOST_PERIODS) * step_s
+        return slowest is None or slowest.settles_s <= (FINE_EXPORT if slowest.shown else MOST_PERIODS) * step_s
 
     def period(self, step_s: float) -> float:
         """The period [s] for an export with a reading every step_s: step_s itself where that suits.
 
-        Else a usual number in which the slowest answer takes some WANTED periods and at most MOST_PERIODS or so, and,
-        as far as that leaves room, the fastest one FAST of them, and a hold of an MV A_HOLD.
+        Else a usual number in which the slowest answer takes some WANTED_PERIODS periods and at most MOST_PERIODS or
+        so, and, as far as that leaves room, the fastest one FAST of them, and a hold of an MV A_HOLD.
         """
         return step_s if self.slowest is None or self.suits(step_s) else self.longer(step_s, self.slowest.settles_s)
 
     def longer(self, step_s: float, slow: float) -> float:
         """A multiple of step_s with which the plant settles within MOST_PERIODS; slow [s] is its settling."""
         fast = min(a.settles_s for a in self.answers)
-        wanted = max(min(slow / WANTED, fast / FAST, self.hold_s / A_HOLD), slow / MOST_PERIODS)
+        wanted = max(min(slow / WANTED_PERIODS, fast / FAST, self.hold_s / A_HOLD), slow / MOST_PERIODS)
         usual = [n for n in NICE_S if slow / MOST_PERIODS <= n <= slow / LEAST_PERIODS and _is_multiple(n, step_s)]
         if usual:
             return float(min(usual, key=lambda n: abs(np.log(n / wanted))))
@@ -233,7 +235,7 @@ def _undecided(pace: Pace, step_s: float, *, given: bool) -> list[Finding]:
     words = (
         f"one model says that it takes {in_words(slow.settles_s)} to settle after {slow.mv}, another does not agree: "
         f"loads or a controller may look like a slow answer. The rows stay at the export's {step_s:g} s; where you "
-        f"know how long it takes, give --period, a {WANTED}th of that"
+        f"know how long it takes, give --period, a {WANTED_PERIODS}th of that"
     )
     return [Finding("period", slow.pv, words)]
 
@@ -269,7 +271,7 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
     found: dict[tuple[str, str], list[tuple[int, bool, float]]] = {}
     thinned: dict[int, tuple[dict[str, Array], NDArray[np.int64]]] = {}
     for factor in FACTORS:
-        if factor > 1 and len(grid) < factor * LEAST_ROWS:
+        if factor > 1 and len(grid) < factor * LEAST_FIT_ROWS:
             break
         thinned[factor] = value, run = _thinned(known, grid.piece, {s.tag for s in mv}, factor, back)
         for name in names:
@@ -278,7 +280,7 @@ def pace_of(series: Mapping[str, Series], tags: Sequence[Tag], step_s: float) ->
                 for i, answer in _answers(model, spans, len(mv)).items():
                     found.setdefault((name, inputs[i]), []).append((factor, *answer))
     settled = {pair: _settling(rows) for pair, rows in found.items()}
-    most = MOST_SHARE * len(grid)
+    most = MOST_SETTLING_SHARE * len(grid)
     answers: dict[bool, list[SettlingAnswer]] = {True: [], False: []}
     for (name, moved), (n, shown) in settled.items():
         if 0 < n <= most:
@@ -322,7 +324,7 @@ def _means(v: Array, first: NDArray[np.int64], n: int) -> Array:
 
 def _answers(model: Linear, spans: Array, n_mv: int) -> dict[int, tuple[bool, float]]:
     """MV -> whether its clear answer settles, and the rows that it takes to; of a ramp, to get going and to stop."""
-    courses = {i: model.step_response(i) for i in range(len(spans)) if model.strength[i] > CLEAR}
+    courses = {i: model.step_response(i) for i in range(len(spans)) if model.strength[i] > CLEAR_ANSWER}
     sizes = {i: float(np.ptp(y)) * spans[i] for i, y in courses.items() if np.isfinite(y).all()}
     found: dict[int, tuple[bool, float]] = {}
     for i, size in sizes.items():
@@ -339,15 +341,15 @@ def _answers(model: Linear, spans: Array, n_mv: int) -> dict[int, tuple[bool, fl
 def _goes_on(course: Array) -> bool:
     """Whether a step response (n,) ends with a steady slope."""
     middle, end = (float(np.median(part)) for part in np.array_split(np.diff(course), 3)[1:])
-    return end != 0 and STEADY < middle / end < 1 / STEADY
+    return end != 0 and RAMP_SLOPE_KEPT < middle / end < 1 / RAMP_SLOPE_KEPT
 
 
 def _late(course: Array) -> float:
-    """LATE times the rows by which a ramp comes later than one that begins at once: dead time and lags together."""
-    first, last = LINE
+    """LATENESS times the rows by which a ramp comes later than one that begins at once: dead time and lags together."""
+    first, last = RAMP_LINE
     slope = (course[last] - course[first]) / (last - first)
     late = last - course[last] / slope if slope else 0.0
-    return LATE * max(float(late), 0.5)
+    return LATENESS * max(float(late), 0.5)
 
 
 def _settling(rows: Sequence[tuple[int, bool, float]]) -> tuple[float, bool]:
@@ -370,7 +372,7 @@ def _settling(rows: Sequence[tuple[int, bool, float]]) -> tuple[float, bool]:
         row = steps / n
         if (steps - row) / AGREES < before < (steps + row) * AGREES:
             both = float(np.sqrt(before * steps))
-            if place < at and both <= FINE:  # less sure, and no reason to leave the export's step
+            if place < at and both <= FINE_EXPORT:  # less sure, and no reason to leave the export's step
                 break
             shown = finest == 1 and first is settles and 1 / AGREES < own / both < AGREES
             return (own, True) if shown else (both, False)
@@ -386,7 +388,7 @@ def _span(v: Array) -> float:
 def _hold(u: Array, piece: NDArray[np.int64]) -> float:
     """Rows that an MV u (n,) is usually held for, at least: the 10 % quantile; infinite where it is not."""
     step = np.abs(np.diff(u))
-    at = np.flatnonzero((step > MOVE * _span(u)) & (piece[1:] == piece[:-1]))
+    at = np.flatnonzero((step > MV_MOVE * _span(u)) & (piece[1:] == piece[:-1]))
     return float(np.quantile(np.diff(at), 0.1)) if len(at) > 1 else np.inf
 
 

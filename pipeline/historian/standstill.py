@@ -22,7 +22,7 @@ from loopwright.pipeline.historian.settling import in_words
 from loopwright.pipeline.metrics import Array
 
 # ---------------------------------------------- zeros of a measured disturbance: a feed that stopped, or a dead sensor
-BETTER = 0.5  # of the other's squared error: then one of the two explains the PV
+EXPLAINING_ERROR = 0.5  # of the other's squared error: then one of the two explains the PV
 
 
 def of_zeros(grid: Grid, signals: Sequence[Tag]) -> list[Finding]:
@@ -65,8 +65,8 @@ def _contradicted(grid: Grid, signals: Sequence[Tag], tag: Tag, values: Array, z
         both = np.isfinite(true) & np.isfinite(false)
         if both.any():
             of_true, of_false = float(np.mean(true[both] ** 2)), float(np.mean(false[both] ** 2))
-            against |= of_false < BETTER * of_true
-            in_favour |= of_true < BETTER * of_false
+            against |= of_false < EXPLAINING_ERROR * of_true
+            in_favour |= of_true < EXPLAINING_ERROR * of_false
     return against and not in_favour
 
 
@@ -80,16 +80,16 @@ Band = tuple[float, float]
 Rows = tuple[int, int]  # from the first to before the second
 
 SAMPLES = 100_000  # of the time of the record
-SHORTEST, BACK = 20, 10  # rows of a stop, and rows in a row that the signals work again
-MOST_SHARE = 0.3  # of the rows: more is how the plant is run
+SHORTEST_STOP, BACK = 20, 10  # rows of a stop, and rows in a row that the signals work again
+MOST_STOPPED = 0.3  # of the rows: more is how the plant is run
 OUTER = 0.02  # quantile at each end of the band where a signal works
-AT_END = 0.01  # of an MV's span at its end
-OFF, QUIET = 0.02, 0.05  # of a feed's usual value, and of its band: below both it is off, and at rest
-PAD, FAR = 0.25, 1.0  # widths of a signal's band beyond it: away; far away
+AT_MV_END = 0.01  # of an MV's span at its end
+FEED_OFF, FEED_QUIET = 0.02, 0.05  # of a feed's usual value, and of its band: below both it is off, and at rest
+BAND_PAD, FAR_BEYOND_BAND = 0.25, 1.0  # widths of a signal's band beyond it: away; far away
 BEYOND_MV = 2.0  # how much farther than the MVs, in widths of the band each: no answer goes so far
-ARRIVED, LONG = 0.1, 5.0  # of a PV's way: it has come to rest; and times the way, a rest that no test holds
+ARRIVED_WAY, LONG_REST = 0.1, 5.0  # of a PV's way: it has come to rest; and times the way, a rest that no test holds
 RETURNED = 0.25  # of how far a PV went in a rest: it is back so near to where it was before
-MOSTLY, STILL = 0.5, 0.8  # of a stop's rows: signals are away; MVs rest, where no end says that they do
+MOSTLY_AWAY, MVS_STILL = 0.5, 0.8  # of a stop's rows: signals are away; MVs rest, where no end says that they do
 MOST_STOPS = 5  # of a feed: one that is off again and again is how the plant is run
 NAMED = 3  # stops whose times are named
 
@@ -114,7 +114,9 @@ class _Plant:
 
     def away(self, rows: Rows) -> list[str]:
         """PVs and disturbances that have left their bands."""
-        return [t for role in ("pv", "dv") for t in self.of(role) if np.mean(self.beyond(t, rows) > PAD) > MOSTLY]
+        return [
+            t for role in ("pv", "dv") for t in self.of(role) if np.mean(self.beyond(t, rows) > BAND_PAD) > MOSTLY_AWAY
+        ]
 
     def off(self, tag: str, rows: Rows) -> bool:
         """Whether a feed is off: near zero beside its usual value, and at rest. A temperature has no zero."""
@@ -122,12 +124,12 @@ class _Plant:
             return False
         v, (low, high) = self.value[tag][slice(*rows)], self.band[tag]
         spread = float(np.ptp(np.quantile(v, [0.05, 0.95])))
-        most = OFF * abs(self.usual[tag])
-        return abs(float(np.median(v))) < most and spread <= QUIET * max(high - low, most)
+        most = FEED_OFF * abs(self.usual[tag])
+        return abs(float(np.median(v))) < most and spread <= FEED_QUIET * max(high - low, most)
 
-    def far(self, rows: Rows, beyond: float = FAR) -> bool:
+    def far(self, rows: Rows, beyond: float = FAR_BEYOND_BAND) -> bool:
         """Whether every PV is far outside its band, in the median by more than ``beyond`` widths."""
-        return all(float(np.median(self.beyond(tag, rows))) > max(FAR, beyond) for tag in self.of("pv"))
+        return all(float(np.median(self.beyond(tag, rows))) > max(FAR_BEYOND_BAND, beyond) for tag in self.of("pv"))
 
 
 def stops(
@@ -173,7 +175,7 @@ def stops(
         )
         spans = [_with_warm_up(plant, rows) for rows in found]
         whole = rests | _spread_over(len(time_s), spans)
-    if _spread_over(len(time_s), spans).mean() > MOST_SHARE:
+    if _spread_over(len(time_s), spans).mean() > MOST_STOPPED:
         found, spans = [], []
     step = float(np.median(np.diff(time_s)))
     seconds = [(float(time_s[a]) - 0.5 * step, float(time_s[b - 1]) + 0.5 * step) for a, b in spans]
@@ -219,7 +221,7 @@ def _held(series: Series, at: Array) -> Array:
 
 
 def _with_return(rests: Where, pvs: Sequence[Array]) -> Where:
-    """The rests (n,), each until all PVs (n,) are back near where they were; the rests alone if that is ``MOST_SHARE``.
+    """The rests (n,), each until all PVs (n,) return near where they were; the rests alone if that is ``MOST_STOPPED``.
 
     A slow warm-up is longer than its stop, and would count as where the plant works.
     """
@@ -231,11 +233,11 @@ def _with_return(rests: Where, pvs: Sequence[Array]) -> Where:
             away = np.abs(v - np.median(v[max(first - BACK, 0) : first]))
             back = np.r_[away[last:] <= RETURNED * away[first:last].max(), False]
             whole[last : last + int(back.argmax())] = True  # nothing of a PV that never comes back
-    return whole if whole.mean() <= MOST_SHARE else rests
+    return whole if whole.mean() <= MOST_STOPPED else rests
 
 
 def _near(u: Array, ends: Sequence[float]) -> Where:
-    return np.min([np.abs(u - end) for end in ends], axis=0) <= AT_END * float(np.ptp(u))
+    return np.min([np.abs(u - end) for end in ends], axis=0) <= AT_MV_END * float(np.ptp(u))
 
 
 def _stated(tag: Tag, series: Series) -> list[float]:
@@ -249,7 +251,7 @@ def _stated(tag: Tag, series: Series) -> list[float]:
 
 def _is_off(v: Array) -> Where:
     """Where a disturbance (n,) is near zero, beside what it usually is."""
-    return np.abs(v) < OFF * abs(_usual(v))
+    return np.abs(v) < FEED_OFF * abs(_usual(v))
 
 
 def _usual(v: Array) -> float:
@@ -257,12 +259,12 @@ def _usual(v: Array) -> float:
 
 
 def _rests(where: Sequence[Where]) -> list[Rows]:
-    """Stretches of at least SHORTEST rows in which all of ``where``, (n,) each, hold; none where that is usual."""
+    """Stretches of at least SHORTEST_STOP rows in which all of ``where``, (n,) each, hold; none where that is usual."""
     both = np.all(where, axis=0)
     start, end = runs_of(both)
-    long = end - start >= SHORTEST
+    long = end - start >= SHORTEST_STOP
     found = list(zip(start[long].tolist(), end[long].tolist(), strict=True))
-    return found if _spread_over(len(both), found).mean() <= MOST_SHARE else []
+    return found if _spread_over(len(both), found).mean() <= MOST_STOPPED else []
 
 
 def _spread_over(n: int, stretches: Sequence[Rows]) -> Where:
@@ -294,9 +296,11 @@ def _is_stop(plant: _Plant, rows: Rows) -> bool:
     if loads:  # one that is as large as never before may explain all
         return False
     beyond = max(float(np.median(plant.beyond(tag, rows))) for tag in plant.of("mv"))
-    if beyond <= PAD:  # it works there: a valve that is closed in cold weather
+    if beyond <= BAND_PAD:  # it works there: a valve that is closed in cold weather
         return False
-    return plant.far(rows, BEYOND_MV * beyond) or (beyond > FAR and plant.far(rows) and _is_long(plant, rows))
+    return plant.far(rows, BEYOND_MV * beyond) or (
+        beyond > FAR_BEYOND_BAND and plant.far(rows) and _is_long(plant, rows)
+    )
 
 
 def _without_feed(plant: _Plant, rows: Rows) -> bool:
@@ -307,7 +311,7 @@ def _without_feed(plant: _Plant, rows: Rows) -> bool:
     for tag in plant.of("mv"):
         u = plant.value[tag]
         v = u[slice(*rows)]
-        if np.mean(np.abs(v - np.median(v)) <= AT_END * float(np.ptp(u))) < STILL:
+        if np.mean(np.abs(v - np.median(v)) <= AT_MV_END * float(np.ptp(u))) < MVS_STILL:
             return False
     return True
 
@@ -319,9 +323,9 @@ def _is_long(plant: _Plant, rows: Rows) -> bool:
         v = plant.value[tag][slice(*rows)]
         end = float(np.median(v[len(v) // 2 :]))
         way = max(abs(v[0] - end), *(abs(edge - end) for edge in plant.band[tag]))
-        there = np.abs(v - end) <= ARRIVED * way
+        there = np.abs(v - end) <= ARRIVED_WAY * way
         took = max(took, int(np.argmax(there)))
-    return rows[1] - rows[0] > LONG * took
+    return rows[1] - rows[0] > LONG_REST * took
 
 
 def _with_warm_up(plant: _Plant, rows: Rows) -> Rows:
@@ -329,7 +333,7 @@ def _with_warm_up(plant: _Plant, rows: Rows) -> Rows:
     first, last = rows
     n = len(next(iter(plant.value.values())))
     beyond = [plant.beyond(tag, (0, n)) for tag in plant.away(rows)]
-    inside, wide = np.all([b == 0 for b in beyond], axis=0), np.all([b <= PAD for b in beyond], axis=0)
+    inside, wide = np.all([b == 0 for b in beyond], axis=0), np.all([b <= BAND_PAD for b in beyond], axis=0)
     while first > 0 and not wide[first - 1]:
         first -= 1
     run = np.convolve(np.r_[inside[last:], np.zeros(BACK)], np.ones(BACK), "valid") == BACK

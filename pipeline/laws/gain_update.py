@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from loopwright.pipeline.laws.base import hold_numbers
 
-LONGEST = 1e4  # periods; a time as long says only that there is no such action
+LONGEST_ACTION = 1e4  # periods; a time as long says only that there is no such action
 NEXT_TO_NOTHING = 1e-8  # share of its bound at which a gain counts as none
 
 
@@ -56,7 +56,7 @@ class PidForm(nn.Module):
 
         tau_i = kc dt/Ki,   tau_d = Kd dt/kc
 
-    A gain that is nothing beside its bound in ``largest`` counts as none, and no time is longer than LONGEST
+    A gain that is nothing beside its bound in ``largest`` counts as none, and no time is longer than LONGEST_ACTION
     periods: what is divided by next to nothing is rounding, and has no meaning either.
 
     Source: [chen2004, eq. 4]; eq. 25 there is the inverse of another form, without the
@@ -74,7 +74,7 @@ class PidForm(nn.Module):
             self,
             forms=[[h, 0, 0, 1, unit], [0, 0, 1, 0, 0], [0, h, 0, 0, 0]],
             least=[NEXT_TO_NOTHING * largest[1], NEXT_TO_NOTHING * largest[0]],
-            longest=LONGEST * h,
+            longest=LONGEST_ACTION * h,
         )
 
     def forward(self, z: Tensor) -> Tensor:

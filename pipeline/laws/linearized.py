@@ -80,7 +80,7 @@ class NnarxPid(AdaptivePid):
         return (y - ahead.y - ahead.slope * move).abs()
 
 
-DOUBLINGS = 12  # most doublings of the penalty within a sample: candidates of 1 to 2^12 times
+PENALTY_DOUBLINGS = 12  # most doublings of the penalty within a sample: candidates of 1 to 2^12 times
 
 
 class LinearizedPid(NnarxPid):
@@ -137,8 +137,8 @@ class LinearizedPid(NnarxPid):
 
     params: Params
     penalty: Tensor  # (1,) fixed
-    doubled: Tensor  # (DOUBLINGS + 1, 1) 1, 2, 4, ..
-    allowed: Tensor  # (DOUBLINGS + 1, 1) linearization error of each; the last candidate has no choice
+    doubled: Tensor  # (PENALTY_DOUBLINGS + 1, 1) 1, 2, 4, ..
+    allowed: Tensor  # (PENALTY_DOUBLINGS + 1, 1) linearization error of each; the last candidate has no choice
     penalty_low: Tensor  # (1,)
     eps_low: Tensor  # (1,)
     none: Tensor  # (1,) larger than any penalty
@@ -152,9 +152,9 @@ class LinearizedPid(NnarxPid):
         hold_numbers(
             self,
             penalty=params.penalty,
-            doubled=[[2.0**j] for j in range(DOUBLINGS + 1)],
+            doubled=[[2.0**j] for j in range(PENALTY_DOUBLINGS + 1)],
             penalty_low=low,
-            allowed=[[params.eps_high]] * DOUBLINGS + [[math.inf]],
+            allowed=[[params.eps_high]] * PENALTY_DOUBLINGS + [[math.inf]],
             eps_low=params.eps_low,
             none=math.inf,
         )

@@ -120,7 +120,7 @@ class RecursivePid(AdaptivePid):
         return mv, self.memory.stored(p, kept), torch.cat([self.gains.info_of(z, slope, free), offset], dim=-1)
 
 
-TERMS = 3  # of F: more would be no PID
+PREFILTER_TERMS = 3  # of F: more would be no PID
 
 
 class SelfTuningPid(ControlLaw):
@@ -175,8 +175,10 @@ class SelfTuningPid(ControlLaw):
         mv_rate: float | None = None
 
         def __post_init__(self) -> None:
-            if len(self.prefilter) > TERMS:
-                raise ValueError(f"prefilter has {len(self.prefilter)} coefficients; a PID has room for {TERMS}")
+            if len(self.prefilter) > PREFILTER_TERMS:
+                raise ValueError(
+                    f"prefilter has {len(self.prefilter)} coefficients; a PID has room for {PREFILTER_TERMS}"
+                )
             if not self.integral > 0:
                 raise ValueError(f"integral is {self.integral}; it must be above 0")
             if not self.slope_min >= 0:
@@ -195,14 +197,14 @@ class SelfTuningPid(ControlLaw):
         require_single_loop(signals, self.name)
         params = in_units(params, signals, self.name)
         unit = signed_unit(signals, params.plant_gain, float(model.weight[model.n_y]))
-        self.model = estimator(self.name, signals, model, unit, params, params.prefilter, TERMS)
+        self.model = estimator(self.name, signals, model, unit, params, params.prefilter, PREFILTER_TERMS)
         n, nu = self.model.size, params.integral
         self.form = PidForm(signals.period_s, unit, params.gain_high)
         of_f = [[0.0, nu, 0.0], [-nu, nu, 0.0], [-2 * nu, nu, nu]]
         hold_numbers(
             self,
             unit=unit,
-            to_gains=of_f + [[0.0] * 3] * (n - TERMS),
+            to_gains=of_f + [[0.0] * 3] * (n - PREFILTER_TERMS),
             slope_min=params.slope_min,
             hi=params.gain_high,
             by_unit=1 / unit,

@@ -8,7 +8,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.simulator import Simulator
-from loopwright.pipeline.tuning.responses import ANSWERS, SHORTEST, STEP, StepResponses
+from loopwright.pipeline.tuning.responses import ANSWERED_CHANGE, RESPONSE_STEP, SHORTEST_STEP_RUN, StepResponses
 
 INSTEAD = "choose law 'predictive' or 'pid', or remove the section"
 
@@ -50,16 +50,16 @@ def require_fit(law: type[ControlLaw], plant: Simulator) -> None:
 def _require_an_observation(law: type[ControlLaw], within: int, plant: Simulator) -> None:
     """LawError unless a PV answers the MV in time: in a period by more than a tenth of its fastest change in one."""
     (x, mv), signal = plant.start, plant.mv_signals[0]
-    size = STEP * (signal.high - signal.low) * (1 if mv[0] < signal.middle else -1)
+    size = RESPONSE_STEP * (signal.high - signal.low) * (1 if mv[0] < signal.middle else -1)
     moved = np.stack([mv, mv + size * (np.arange(len(mv)) == 0)])
     x, advance, course = np.tile(x, (2, 1)), plant.many(2), []
-    for _ in range(SHORTEST):
+    for _ in range(SHORTEST_STEP_RUN):
         x = advance(x, moved)
         course.append(plant.measured(x))
     answer = np.abs(np.diff(np.array(course), axis=1)[:, 0])  # (n, n_pv)
     change = np.abs(np.diff(answer, axis=0, prepend=0.0))
-    answered = change > ANSWERS * change.max(axis=0)
-    after = np.where(answered.any(axis=0), 1 + answered.argmax(axis=0), SHORTEST)
+    answered = change > ANSWERED_CHANGE * change.max(axis=0)
+    after = np.where(answered.any(axis=0), 1 + answered.argmax(axis=0), SHORTEST_STEP_RUN)
     if min(after) > within:
         found = ", ".join(f"{s.name} answers after {k}" for s, k in zip(plant.pv_signals, after, strict=True))
         raise LawError(

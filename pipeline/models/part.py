@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from loopwright.pipeline.models.static.sweep import SweepResult
 Regions = Mapping[str, tuple[float, float]]
 Result_co = TypeVar("Result_co", covariant=True)
-ROWS = 8192  # predicted in one call
+PREDICTED_ROWS = 8192  # predicted in one call
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +159,7 @@ class StaticPart(Part):
 def predict(model: Model, x: Array) -> Array:
     """Outputs (N, n_out) of a model for inputs (N, n_in), a chunk of rows at a time."""
     with torch.no_grad():
-        return np.concatenate([model(rows).numpy() for rows in torch.split(torch.from_numpy(x), ROWS)])
+        return np.concatenate([model(rows).numpy() for rows in torch.split(torch.from_numpy(x), PREDICTED_ROWS)])
 
 
 def accuracy(actual: Array, predicted: Array, cv: Array, regions: Regions) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = dict[str, dict[str, dict[str, float]]]
-SCHEMA = 1  # of the file: a reader refuses another
+BOUNDS_SCHEMA = 1  # of the file: a reader refuses another
 DEFAULTS: dict[str, Any] = {
     "metric": "mae",
     "recipe": False,
@@ -99,7 +99,7 @@ def read_stored(path: Path) -> dict[str, Any]:
         stored = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return stored if isinstance(stored, dict) and stored.get("schema") == SCHEMA else {}
+    return stored if isinstance(stored, dict) and stored.get("schema") == BOUNDS_SCHEMA else {}
 
 
 def stored_bounds(case: Case, path: Path | None = None) -> tuple[Bounds, list[str]]:

@@ -24,8 +24,8 @@ from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 HORIZON = (20, 60)  # least and most samples that a plan looks ahead
 EVERY = 4  # parts of the horizon: a plan is followed over one of them while its predictions come true
-CAME_TRUE = 1e-7  # scaled: how far a state may be from its prediction
-ARRIVED = 1e-4  # of the CVs' ranges: a plan whose error from here on is less is followed to its end
+SCALED_CAME_TRUE = 1e-7  # scaled: how far a state may be from its prediction
+ARRIVED_ERROR = 1e-4  # of the CVs' ranges: a plan whose error from here on is less is followed to its end
 MOST_ITERATIONS = 200  # of the solver at a sample
 
 
@@ -200,9 +200,11 @@ def run_sampled(
         before = (test.sp[k - 1], parameters[max(k - 2, 0)], measured[k - 1])
         same = k > 0 and all(map(np.array_equal, (sp, p, dv), before))
         expected = (
-            plan is not None and same and np.max(np.abs(x - plan.x[age])) <= CAME_TRUE * max(1.0, np.abs(x).max())
+            plan is not None
+            and same
+            and np.max(np.abs(x - plan.x[age])) <= SCALED_CAME_TRUE * max(1.0, np.abs(x).max())
         )
-        arrived = plan is not None and age < horizon.n and float(plan.error[age:].max()) <= ARRIVED
+        arrived = plan is not None and age < horizon.n and float(plan.error[age:].max()) <= ARRIVED_ERROR
         if plan is None or not expected or age >= (horizon.n if arrived else max(horizon.n // EVERY, 1)):
             found = horizon.solve(x, mv, sp, p, dv, plan if expected else None, age)
             if not found.solved and plan is not None and expected:
@@ -218,8 +220,8 @@ def run_sampled(
 
 
 # --------------------------------------------------------------------------- bounds of a case that is tested on models
-SCHEMA = 1
-ANSWERS = 3  # a hold lasts so many times as long as an answer of the plant; without a hold, the whole test
+MODEL_BOUNDS_SCHEMA = 1
+ANSWERS_A_HOLD = 3  # a hold lasts so many times as long as an answer of the plant; without a hold, the whole test
 
 
 def model_bounds(case: Case, kept: Path) -> Bounds:
@@ -240,7 +242,7 @@ def model_bounds(case: Case, kept: Path) -> Bounds:
     known |= {keys[item]: figures for item, figures in zip(work, found, strict=True)}
     used = {key: known[key] for key in keys.values()}
     if work or set(used) != set(_read(kept)):
-        write_json(kept, {"schema": SCHEMA, "figures": used})
+        write_json(kept, {"schema": MODEL_BOUNDS_SCHEMA, "figures": used})
     bounds: Bounds = {}
     for name, rows in tests.items():
         figures = together((used[keys[name, i]] for i in range(len(rows))), case.metrics)
@@ -252,7 +254,7 @@ def model_bounds(case: Case, kept: Path) -> Bounds:
 def _bound(case: Case, item: tuple[str, int]) -> dict[str, float]:
     test = case.tests()[item[0]][item[1]]
     plant = _plant(test)
-    looks = int(np.clip(-(-(test.hold or test.samples // 2) // ANSWERS), *HORIZON))
+    looks = int(np.clip(-(-(test.hold or test.samples // 2) // ANSWERS_A_HOLD), *HORIZON))
     figures = run_sampled(_horizon(_Same(plant), looks), test, case.score)
     return {name: float(f"{value:.6g}") for name, value in figures.items()}
 
@@ -304,4 +306,4 @@ def _read(kept: Path) -> dict[str, dict[str, float]]:
         stored: Any = read_json(kept)
     except (OSError, ValueError, PipelineError):
         return {}
-    return dict(stored["figures"]) if isinstance(stored, dict) and stored.get("schema") == SCHEMA else {}
+    return dict(stored["figures"]) if isinstance(stored, dict) and stored.get("schema") == MODEL_BOUNDS_SCHEMA else {}

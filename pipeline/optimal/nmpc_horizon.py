@@ -68,7 +68,7 @@ def trace(plant: EquationPlant, elements: int, degree: int) -> ca.Function:
 
 # --------------------------------------------------------------------------------------------------------- the horizon
 # The plan is never allowed to leave the states' ranges by more than this fraction of them.
-MARGIN = 0.1
+PLAN_MARGIN = 0.1
 
 # w below, for absolute and for squared errors. Squared ones are small where absolute ones still count.
 MOVE_WEIGHT = {False: 1e-3, True: 1e-6}
@@ -170,7 +170,7 @@ class Horizon:
         self._solver = ca.nlpsol("horizon", "ipopt", problem, options)
 
         low, high = np.zeros((rows, n)), np.ones((rows, n))
-        low[:n_z], high[:n_z] = -MARGIN, 1 + MARGIN
+        low[:n_z], high[:n_z] = -PLAN_MARGIN, 1 + PLAN_MARGIN
         self._limited: list[tuple[int, int]] = []  # a state, and where its value at sample 1 stands
         for name, kept in (limits or {}).items():
             state = self._state(name)

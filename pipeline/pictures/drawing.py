@@ -29,7 +29,7 @@ PALETTE = ("#d55e00", "#0072b2", "#cc79a7", "#009e73", "#56b4e9", "#e69f00", "#8
 SHADES = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9")
 """Colours of several settings of one law."""
 OTHER_COLOUR = "#444444"
-SIZE = (8.4, 5.2)  # inches; 100 dots each: MLflow shows pictures in their own size
+PICTURE_SIZE = (8.4, 5.2)  # inches; 100 dots each: MLflow shows pictures in their own size
 STYLE: Any = {
     "font.size": 10.0,
     "axes.spines.top": False,

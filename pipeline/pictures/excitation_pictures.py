@@ -10,9 +10,9 @@ from matplotlib.figure import Figure as Canvas
 from loopwright.pipeline.historian.cleaning.findings import InputReport, RecordJudgement
 from loopwright.pipeline.historian.cleaning.record_rows import evenly
 from loopwright.pipeline.historian.excitation import (
-    ALIKE,
+    ALIKE_INPUTS,
     ENOUGH_MOVES,
-    FOLLOWS,
+    FEEDBACK_SHARE,
     ROWS_A_PARAMETER,
     Spectrum,
     moves_of,
@@ -20,12 +20,12 @@ from loopwright.pipeline.historian.excitation import (
 )
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.metrics import Array
-from loopwright.pipeline.pictures.drawing import SIZE, STYLE
+from loopwright.pipeline.pictures.drawing import PICTURE_SIZE, STYLE
 
 POWER, COHERENCE, BAND, LIMIT = "#0072b2", "#d55e00", "#cccccc", "#882255"
 MOST_INPUTS = 6  # inputs that have a picture, and pairs of inputs whose correlation is drawn
 ROW = 2.1  # inches
-BINS = 20  # of a histogram of moves
+HISTOGRAM_BINS = 20  # of a histogram of moves
 
 
 def inputs(found: Screened) -> Canvas:
@@ -36,7 +36,7 @@ def inputs(found: Screened) -> Canvas:
     spectra = spectra_of(record, models)
     u = np.hstack([record.mv, record.dv])
     with rc_context(STYLE):
-        canvas = Canvas(figsize=(SIZE[0] * 1.25, 0.5 + ROW * len(reports)), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0] * 1.25, 0.5 + ROW * len(reports)), layout="constrained")
         panels = canvas.subplots(len(reports), 3, squeeze=False)
         for i, (row, report) in enumerate(zip(panels, reports, strict=True)):
             _moves(row[0], report, moves_of(u[:, i], record.run))
@@ -52,7 +52,7 @@ def inputs(found: Screened) -> Canvas:
 
 def _moves(axes: Axes, report: InputReport, sizes: Array) -> None:
     if sizes.size:
-        axes.hist(sizes, bins=BINS, color=POWER)
+        axes.hist(sizes, bins=HISTOGRAM_BINS, color=POWER)
     axes.set_title(f"{report.name}: {report.moves} moves, {ENOUGH_MOVES} wanted", fontsize=8.5, parse_math=False)
     axes.set_xlabel(f"size [{report.unit}]" if report.unit else "size", fontsize=8, parse_math=False)
     axes.tick_params(labelsize=7.5)
@@ -94,12 +94,12 @@ def verdict(found: Screened) -> Canvas:
     """Feedback of each MV, correlation of each pair of inputs, rows over parameters; dashed: where doubt begins."""
     v = found.report.verdict
     with rc_context(STYLE):
-        canvas = Canvas(figsize=(SIZE[0] * 1.25, 2.6), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0] * 1.25, 2.6), layout="constrained")
         first, second, third = canvas.subplots(1, 3)
         loops = {f"{i.name} after {pv}": 100 * s for i in v.inputs for pv, s in i.follows.items()}
-        _bars(first, loops, 100 * FOLLOWS, "feedback: share of moves\nthat a PV's past explains [%]", 100.0)
+        _bars(first, loops, 100 * FEEDBACK_SHARE, "feedback: share of moves\nthat a PV's past explains [%]", 100.0)
         pairs = dict(sorted(v.correlation.items(), key=lambda p: -abs(p[1]))[:MOST_INPUTS])
-        _bars(second, {k: abs(r) for k, r in pairs.items()}, ALIKE, "correlation of two inputs", 1.0)
+        _bars(second, {k: abs(r) for k, r in pairs.items()}, ALIKE_INPUTS, "correlation of two inputs", 1.0)
         rows = {"rows a parameter": v.rows / max(v.parameters, 1)}
         _bars(third, rows, ROWS_A_PARAMETER, _rows_title(v), None)
         return canvas

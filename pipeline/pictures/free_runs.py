@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Canvas
 
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome
-from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, Draw, clear_legend, scale
+from loopwright.pipeline.pictures.drawing import PALETTE, PICTURE_SIZE, Draw, clear_legend, scale
 from loopwright.pipeline.pictures.numbers import number
 
 TRAINED = {"one_step_trained": ("one step", "s"), "free_run_trained": ("free runs", "o")}
@@ -36,7 +36,7 @@ def free_run_picture(model_set: str, pv: str, unit: str) -> Draw:
     """Error one step ahead against error running free, a point a data seed; a line joins a network's two trainings."""
 
     def draw(evidence: Evidence) -> Canvas:
-        canvas = Canvas(figsize=(SIZE[0], 4.4), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0], 4.4), layout="constrained")
         axes = canvas.subplots()
         known: list[Figures] = []
         for kind, (name, colour) in NETWORKS.items():

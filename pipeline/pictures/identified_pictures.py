@@ -14,7 +14,7 @@ from loopwright.pipeline.evaluation.law_evidence import Array
 from loopwright.pipeline.evaluation.model_evidence import identified_part
 from loopwright.pipeline.pictures.drawing import (
     PALETTE,
-    SIZE,
+    PICTURE_SIZE,
     axis_label,
     fit_labels,
     gain_unit,
@@ -28,25 +28,25 @@ from loopwright.pipeline.simulation.rests import local_gains
 from loopwright.serving.manifest import Signal
 
 LAW, OTHER = PALETTE[1], "#8fb8d6"
-PANEL, WIDEST, LOWEST = (2.9, 1.9), 13.0, 3.2  # inches
-SMALL = 8.0  # points of the numbers at the axes of a grid of panels
-QUANTILES = (0.1, 0.9)  # of a record's MV: over them the gains are taken, as in the report's table
-PLACES = 7  # values of an MV at which a gain is drawn
-LAGS = 40  # [samples] largest lag of the residual's correlation with itself that is drawn
-HISTOGRAM_TICKS, PLAIN = 4, (-2, 4)  # intervals at most; powers of ten between which numbers are written out
-SURE = 2.58  # standard deviations of a white residual's correlation that 99 % stay within
-SHOWN = 800  # samples of a free run
+GRID_PANEL, WIDEST, LOWEST = (2.9, 1.9), 13.0, 3.2  # inches
+AXIS_FONT = 8.0  # points of the numbers at the axes of a grid of panels
+GAIN_QUANTILES = (0.1, 0.9)  # of a record's MV: over them the gains are taken, as in the report's table
+DRAWN_GAINS = 7  # values of an MV at which a gain is drawn
+DRAWN_LAGS = 40  # [samples] largest lag of the residual's correlation with itself that is drawn
+HISTOGRAM_TICKS, PLAIN_POWERS = 4, (-2, 4)  # intervals at most; powers of ten between which numbers are written out
+WHITE_SDS = 2.58  # standard deviations of a white residual's correlation that 99 % stay within
+DRAWN_SAMPLES = 800  # samples of a free run
 IN_TABLE = "gain at the middle ± standard deviation, as in the table"
 SIGNS = {"+": "rises with", "-": "falls with", "uncertain": "may rise or fall with"}
 
 
 def _grid(rows: int, columns: int, **shared: Any) -> tuple[Canvas, list[list[Axes]]]:
-    width = float(np.clip(columns * PANEL[0], SIZE[0], WIDEST))
-    canvas = Canvas(figsize=(width, max(rows * PANEL[1] + 1.0, LOWEST)), layout="constrained")
+    width = float(np.clip(columns * GRID_PANEL[0], PICTURE_SIZE[0], WIDEST))
+    canvas = Canvas(figsize=(width, max(rows * GRID_PANEL[1] + 1.0, LOWEST)), layout="constrained")
     panels = [list(row) for row in canvas.subplots(rows, columns, squeeze=False, **shared)]
     if columns > 1:
         for axes in (a for row in panels for a in row):
-            axes.tick_params(labelsize=SMALL)
+            axes.tick_params(labelsize=AXIS_FONT)
     return canvas, panels
 
 
@@ -106,11 +106,11 @@ def gains_picture(evidence: Evidence) -> Canvas:
     plant, record = evidence.case.plant, evidence.case.replayed[0]
     table: Mapping[str, Any] = identified_part(evidence.models).get("gains") or {}
     others = list({id(t.plant): t.plant for tests in evidence.tests.values() for t in tests if t.plant}.values())
-    middle, (low, high) = np.median(record.mv, axis=0), np.quantile(record.mv, QUANTILES, axis=0)
+    middle, (low, high) = np.median(record.mv, axis=0), np.quantile(record.mv, GAIN_QUANTILES, axis=0)
     canvas, panels = _grid(len(plant.sp_signals), len(plant.mv_signals), sharex="col")
     titles = []
     for j, mv in enumerate(plant.mv_signals):
-        places = np.linspace(low[j], high[j], PLACES)
+        places = np.linspace(low[j], high[j], DRAWN_GAINS)
         found = [local_gains(p, j, places, middle, len(plant.sp_signals)) for p in (*others, plant)]
         for i, cv in enumerate(plant.sp_signals):
             axes, rate = panels[i][j], bool(found[-1][1][:, i].any())
@@ -142,7 +142,7 @@ def free_run_picture(evidence: Evidence) -> Canvas:
         raise NotMeasuredError
     measured, run = (np.reshape(arrays[k], (len(arrays["time_s"]), -1)) for k in ("measured", "free run"))
     cvs = evidence.case.plant_class.sp_signals[: measured.shape[1]]
-    canvas = Canvas(figsize=(SIZE[0] * 1.15, 0.9 + 3.0 * len(cvs)), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0] * 1.15, 0.9 + 3.0 * len(cvs)), layout="constrained")
     panels = canvas.subplots(2 * len(cvs), 2, squeeze=False, width_ratios=(3, 1), height_ratios=(2, 1) * len(cvs))
     rows = (identified_part(evidence.models).get("structure") or {}).get("rows_ahead")
     label = "free run of the model" if rows is None else f"predicted by the model up to {rows} samples ahead"
@@ -155,23 +155,23 @@ def free_run_picture(evidence: Evidence) -> Canvas:
 
 def _free_run_of(panels: Any, time_s: Array, measured: Array, run: Array, cv: Signal, label: str) -> None:
     (above, beside), (below, spread) = panels
-    time, words = time_axis(time_s[:SHOWN])
+    time, words = time_axis(time_s[:DRAWN_SAMPLES])
     residual = measured - run
-    above.plot(time, measured[:SHOWN], color="black", linewidth=0.9, label="measured")
-    above.plot(time, run[:SHOWN], color=PALETTE[0], linewidth=1.2, label=label)
+    above.plot(time, measured[:DRAWN_SAMPLES], color="black", linewidth=0.9, label="measured")
+    above.plot(time, run[:DRAWN_SAMPLES], color=PALETTE[0], linewidth=1.2, label=label)
     above.set_ylabel(signal_label(cv))
-    below.plot(time, residual[:SHOWN], color=LAW, linewidth=0.8)
+    below.plot(time, residual[:DRAWN_SAMPLES], color=LAW, linewidth=0.8)
     below.set_ylabel(axis_label("residual", cv.unit), fontsize=8.5)
     below.set_xlabel(f"{words}, counted over the rows held out; gaps of the record are closed", fontsize=8.5)
     for axes in (above, below):
         axes.margins(x=0.01)
     known = residual[np.isfinite(residual)]
-    if len(known) > 2 * LAGS:
+    if len(known) > 2 * DRAWN_LAGS:
         centred = known - known.mean()
-        lags = np.arange(1, LAGS + 1)
+        lags = np.arange(1, DRAWN_LAGS + 1)
         power = max(float(centred @ centred), 1e-300)
         own = [float(centred[lag:] @ centred[:-lag]) / power for lag in lags]
-        beside.axhspan(-SURE / np.sqrt(len(known)), SURE / np.sqrt(len(known)), color="#dddddd", linewidth=0)
+        beside.axhspan(-WHITE_SDS / np.sqrt(len(known)), WHITE_SDS / np.sqrt(len(known)), color="#dddddd", linewidth=0)
         beside.vlines(lags, 0, own, color=LAW, linewidth=1.2)
         beside.set_title("residual with itself", fontsize=9)
         beside.set_xlabel("lag [samples]", fontsize=8.5)
@@ -179,7 +179,7 @@ def _free_run_of(panels: Any, time_s: Array, measured: Array, run: Array, cv: Si
         spread.set_xlabel(axis_label("residual", cv.unit), fontsize=8.5)
         spread.set_yticks([])
         spread.locator_params(axis="x", nbins=HISTOGRAM_TICKS)
-        spread.ticklabel_format(axis="x", style="sci", scilimits=PLAIN)
+        spread.ticklabel_format(axis="x", style="sci", scilimits=PLAIN_POWERS)
 
 
 def _one(signal: Signal) -> str:

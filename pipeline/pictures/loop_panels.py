@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.law_evidence import Array, Loop
 from loopwright.pipeline.pictures.drawing import (
+    PICTURE_SIZE,
     REFERENCE,
     SET_POINT,
-    SIZE,
     axis_label,
     fit_labels,
     layer,
@@ -27,15 +27,15 @@ from loopwright.pipeline.pictures.drawing import (
 )
 from loopwright.serving.manifest import Signal
 
-STRIP = 0.7  # height of a discrete MV's panel, where a continuous one's is 2
+DISCRETE_HEIGHT = 0.7  # height of a discrete MV's panel, where a continuous one's is 2
 STRIP_ROOM = 0.3  # above and below its values, as a share of their range
 INCHES = 0.84  # that a height of 1 takes
 CV_HEIGHT, SHARED_HEIGHT = 3.0, 2.2  # of the panel of the controlled variable, and of each of several
 MV_HEIGHT, OWN_HEIGHT = 2.0, 1.2  # of the panel of a continuous MV, and of one that a ringing law has for itself
 MV_THINNER = 0.7  # its line beside the controlled variable's
-WINDOWS = 50  # parts of the time axis, each about 15 pixels wide, in which reversals are counted
+REVERSAL_WINDOWS = 50  # parts of the time axis, each about 15 pixels wide, in which reversals are counted
 MOST_REVERSALS = 4  # of an MV in such a part; more of them run into one another
-SWING = 0.02  # of the MV's range: a smaller move is no reversal
+LEAST_REVERSAL = 0.02  # of the MV's range: a smaller move is no reversal
 RINGING = 0.05  # share of the samples at which an MV reverses too fast to draw: from here on it has its own panel
 FAST = "shaded: swings too fast to draw, with their mean"
 
@@ -73,7 +73,7 @@ class LoopPanels:
         more = 1.2 * bool(late_from) + INCHES * (
             sum(above) - CV_HEIGHT + sum(below) - MV_HEIGHT + OWN_HEIGHT * len(self.moved)
         )
-        self.canvas = Canvas(figsize=(SIZE[0], SIZE[1] + more), layout="constrained")
+        self.canvas = Canvas(figsize=(PICTURE_SIZE[0], PICTURE_SIZE[1] + more), layout="constrained")
         panels = list(self.canvas.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights}))
         self.cvs: list[Axes] = panels[: len(cvs)]
         first_mv = len(panels) - len(self.moved) - len(ordered)
@@ -111,7 +111,7 @@ class LoopPanels:
 
     def _height(self, i: int, owner: str) -> float:
         if self.signals[i].values is not None:
-            return STRIP
+            return DISCRETE_HEIGHT
         return OWN_HEIGHT if owner else MV_HEIGHT
 
     def add(self, loop: Loop, label: str, colour: str) -> None:
@@ -178,16 +178,16 @@ def _columns(loop: Loop) -> list[Array]:
 
 def _window(mv: Array) -> int:
     """Samples of one of the parts in which reversals are counted."""
-    return max(2, len(mv) // WINDOWS)
+    return max(2, len(mv) // REVERSAL_WINDOWS)
 
 
 def too_fast(mv: Array, signal: Signal) -> NDArray[np.bool_]:
     """Samples (n,) around which a continuous MV (n,) reverses more often than a picture can show."""
-    if signal.values is not None or len(mv) < WINDOWS:
+    if signal.values is not None or len(mv) < REVERSAL_WINDOWS:
         return np.zeros(len(mv), dtype=bool)
     width = _window(mv)
     moved = np.diff(mv)
-    at = np.flatnonzero(np.abs(moved) > SWING * (signal.high - signal.low))
+    at = np.flatnonzero(np.abs(moved) > LEAST_REVERSAL * (signal.high - signal.low))
     # A pulse may rest between its two moves.
     turned = at[1:][moved[at[1:]] * moved[at[:-1]] < 0]
     reversals = np.zeros(len(mv))

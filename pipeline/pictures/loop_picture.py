@@ -20,11 +20,12 @@ from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.serving.manifest import Signal
 
 Array = NDArray[np.float64]
-LATE = 10  # an error stays that is there over the last tenth of a run
-STAYS, AT_END = 0.002, 0.001  # of a range: an error that counts, and the distance of an MV that rests at an end
+STAYING_PART = 10  # an error stays that is there over the last tenth of a run
+# of a range: an error that counts, and the distance of an MV that rests at an end
+STAYING_ERROR, RESTING_AT_END = 0.002, 0.001
 RUN_DPI = 120.0  # dots an inch of a file; those of reports are MLflow's
 FEW_COLOURS = 128  # lines in some colours, each with the shades of its edges
-STRIP = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
+DISCRETE_SHARE = 0.35  # height of a discrete MV's panel, where a continuous one's is 1
 
 
 @dataclass(slots=True, eq=False)
@@ -66,15 +67,15 @@ def summary(plant: Simulator, history: History, metric: Metric = METRICS["mae"])
 
 def _jammed(plant: Simulator, error: Array, mv: Array) -> list[str]:
     """A line on MVs (n, n_mv) that rest at an end of their range while an error (n, n_cv) stays; else none."""
-    late = len(mv) // LATE + 1
+    late = len(mv) // STAYING_PART + 1
     spans = np.array([s.high - s.low for s in plant.sp_signals])
-    if not np.any(np.abs(error[-late:].mean(axis=0)) > STAYS * spans):
+    if not np.any(np.abs(error[-late:].mean(axis=0)) > STAYING_ERROR * spans):
         return []
     ends = [
         f"{s.name} at {end:g}" + ("" if s.unit == "-" else f" {s.unit}")
         for s, values in zip(plant.mv_signals, mv[-late:].T, strict=True)
         for end in (s.low, s.high)
-        if s.values is None and np.all(np.abs(values - end) <= AT_END * (s.high - s.low))
+        if s.values is None and np.all(np.abs(values - end) <= RESTING_AT_END * (s.high - s.low))
     ]
     if not ends:
         return []
@@ -109,7 +110,7 @@ def draw(
 
     time_s = np.array(history.time_s)
     sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
-    heights = [1.0] * len(plant.sp_signals) + [1.0 if s.values is None else STRIP for s in plant.mv_signals]
+    heights = [1.0] * len(plant.sp_signals) + [1.0 if s.values is None else DISCRETE_SHARE for s in plant.mv_signals]
     figure = Figure(figsize=(9, 1.0 + 2.4 * sum(heights)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]

@@ -13,8 +13,8 @@ from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import BASE, Array, Loop
 from loopwright.pipeline.evaluation.poor_laws import worst_cycle
 from loopwright.pipeline.pictures.drawing import (
+    PICTURE_SIZE,
     SHADES,
-    SIZE,
     axis_label,
     colour_of,
     legend_below,
@@ -39,7 +39,7 @@ LIKE_CV = (
     "wanted_jacket",
 )
 """Info in the unit of the controlled variable."""
-SHORTEST, LONGEST = 1e-3, 9e3  # periods; times below and above say that there is no such action
+SHORTEST_PID_TIME, LONGEST_PID_TIME = 1e-3, 9e3  # periods; times below and above say that there is no such action
 ORDERS_FOR_LOG = 2.0  # powers of ten that these must span to be drawn over them
 
 
@@ -92,7 +92,7 @@ def info_picture(evidence: Evidence, figure: Figure) -> Canvas:
     if not found:
         raise NotMeasuredError
     count = len(figure.info)
-    canvas = Canvas(figsize=(SIZE[0], 1.0 + 1.7 * count), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 1.0 + 1.7 * count), layout="constrained")
     panels = list(np.atleast_1d(canvas.subplots(count, 1, sharex=True)))
     for label, (colour, loop, columns) in found.items():
         time, words = time_axis(loop["time_s"])
@@ -136,8 +136,8 @@ def finite(values: Array, name: str, period_s: float) -> Array:
     """An info (n,) as it is drawn: a time of thousands of periods stands for no action, a tiny one for 0."""
     if not name.endswith("_s"):
         return values
-    values = np.where(values < SHORTEST * period_s, 0.0, values)
-    return np.where(values > LONGEST * period_s, np.nan, values)
+    values = np.where(values < SHORTEST_PID_TIME * period_s, 0.0, values)
+    return np.where(values > LONGEST_PID_TIME * period_s, np.nan, values)
 
 
 def over_orders(values: Array) -> bool:

@@ -17,8 +17,8 @@ from loopwright.pipeline.evaluation.law_evidence import Array
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.pictures.drawing import (
     PALETTE,
+    PICTURE_SIZE,
     SET_POINT,
-    SIZE,
     axis_label,
     colour_of,
     fit_labels,
@@ -41,7 +41,7 @@ ONE_STEP = {
     "recursive": ("recursive", "#cc79a7"),
 }
 RECURSIVE_SHADES = ("#cc79a7", "#009e73", "#d55e00")
-BEYOND = 0.5
+PANEL_BEYOND = 0.5
 """Share of the measured range that a panel reaches beyond it; recursive models leave any."""
 
 
@@ -52,7 +52,7 @@ def predictions_picture(evidence: Evidence, figure: Figure) -> Canvas:
     if arrays is None:
         raise NotMeasuredError
     time_s, actual, predicted = (np.ravel(arrays[k]) for k in ("time_s", "actual", "predicted"))
-    canvas = Canvas(figsize=(SIZE[0], 4.2), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 4.2), layout="constrained")
     axes = canvas.subplots(1, 2, gridspec_kw={"width_ratios": (2.4, 1)})
     n = min(len(actual), 100)
     # No line: a random split leaves samples that do not follow one another.
@@ -80,7 +80,7 @@ def one_step_picture(evidence: Evidence, figure: Figure) -> Canvas:
         raise NotMeasuredError
     recursive = [key for key in names if key.startswith("recursive")]
     groups = [group for group in ([n for n in names if n not in recursive], recursive) if group]
-    canvas = Canvas(figsize=(SIZE[0], 1.2 + 2.2 * len(groups)), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 1.2 + 2.2 * len(groups)), layout="constrained")
     panels = list(np.atleast_1d(canvas.subplots(len(groups), 1, sharex=True)))
     time, words = time_axis(np.ravel(arrays["time_s"]))
     for axes, group in zip(panels, groups, strict=True):
@@ -101,7 +101,7 @@ def _one_step_panel(axes: Axes, time: Array, arrays: Mapping[str, Array], group:
             label, colour = f"{label}, f = {factor}", RECURSIVE_SHADES[i % len(RECURSIVE_SHADES)]
         sse = number(float(np.sum((measured - predicted) ** 2)))
         axes.plot(time, predicted, color=colour, linewidth=1.3, label=f"{label}, SSE {sse}", zorder=3)
-    room = BEYOND * float(np.ptp(measured))
+    room = PANEL_BEYOND * float(np.ptp(measured))
     axes.set_ylim(float(measured.min()) - room, float(measured.max()) + room)
     axes.set_ylabel("$y$")
     axes.margins(x=0.01)
@@ -112,7 +112,7 @@ def candidates_picture(table: Mapping[str, Any], unit: str) -> Canvas:
     """One-step and free-run error [``unit``] of each candidate of a search, and which was chosen."""
     rows = sorted(table["rows"], key=lambda row: (row["parameters"], row["free_run_rmse"]))
     at = np.arange(len(rows))
-    canvas = Canvas(figsize=(SIZE[0], 3.8), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 3.8), layout="constrained")
     axes = canvas.subplots()
     kinds = (("free_run_rmse", "free run", "o", "#0072b2"), ("rmse", "one step", "s", "#e69f00"))
     for key, words, mark, colour in kinds:
@@ -135,8 +135,8 @@ def candidates_picture(table: Mapping[str, Any], unit: str) -> Canvas:
 
 # ----------------------------------------------------------------------------------- the replay of a law over a record
 DONE = "#56b4e9"  # neither the baseline's grey nor the first law's colour
-MOST = 600  # rows: more cannot be told apart
-CV_HEIGHT, MV_HEIGHT, ROOM = 1.7, 1.9, 1.0  # inches
+MOST_DRAWN_ROWS = 600  # rows: more cannot be told apart
+CV_INCHES, MV_INCHES, ROOM_INCHES = 1.7, 1.9, 1.0  # inches
 
 
 def replay_picture(evidence: Evidence, law: str) -> Canvas:
@@ -146,10 +146,10 @@ def replay_picture(evidence: Evidence, law: str) -> Canvas:
         raise NotMeasuredError
     plant = evidence.case.plant_class
     cvs, mvs = plant.sp_signals, plant.mv_signals
-    heights = [CV_HEIGHT] * len(cvs) + [MV_HEIGHT] * len(mvs)
-    canvas = Canvas(figsize=(SIZE[0], ROOM + sum(heights)), layout="constrained")
+    heights = [CV_INCHES] * len(cvs) + [MV_INCHES] * len(mvs)
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], ROOM_INCHES + sum(heights)), layout="constrained")
     panels = list(np.atleast_1d(canvas.subplots(len(heights), 1, sharex=True, gridspec_kw={"height_ratios": heights})))
-    rows = {name: values[-MOST:] for name, values in loop.items()}
+    rows = {name: values[-MOST_DRAWN_ROWS:] for name, values in loop.items()}
     time, words = time_axis(rows["time_s"])
     for i, (axes, signal) in enumerate(zip(panels, cvs, strict=False)):
         axes.plot(time, rows["pv"][:, i], color="black", linewidth=0.9, label="recorded")

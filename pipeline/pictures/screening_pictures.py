@@ -16,14 +16,14 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from loopwright.pipeline.historian.cleaning.findings import TagReport
+from loopwright.pipeline.historian.files.date_forms import DAY_S
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import runs_of
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.metrics import Array
-from loopwright.pipeline.pictures.drawing import SIZE, STYLE, axis_label, legend_below, time_axis
+from loopwright.pipeline.pictures.drawing import PICTURE_SIZE, STYLE, axis_label, legend_below, time_axis
 
-DAY_S = 86_400.0  # [s]
-TICKS = (4, 12)  # fewest and most
+TIME_TICKS = (4, 12)  # fewest and most
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class ExportTimes:
     def dress(self, axis: Axis) -> None:
         """Give the axis the ticks of dates, where there are dates."""
         if self.zone:
-            locator = AutoDateLocator(tz=self.local, minticks=TICKS[0], maxticks=TICKS[1])  # type: ignore[no-untyped-call]
+            locator = AutoDateLocator(tz=self.local, minticks=TIME_TICKS[0], maxticks=TIME_TICKS[1])  # type: ignore[no-untyped-call]
             axis.set_major_locator(locator)
             axis.set_major_formatter(ConciseDateFormatter(locator, tz=self.local))  # type: ignore[no-untyped-call]
 
@@ -76,18 +76,18 @@ COLOURS = {
     Reason.STOP: "#bbaa88", Reason.LEFT_OUT: "#aaaaaa",
 }  # fmt: skip
 LINE = "#0072b2"
-POINTS = 3000  # of a line; more are drawn by their extremes
-PANEL, HEAD = 1.35, 1.0  # inches
+LINE_POINTS = 3000  # of a line; more are drawn by their extremes
+TREND_INCHES, HEAD_INCHES = 1.35, 1.0  # inches
 MOST_PANELS, MOST_DETAILS = 8, 6  # tags that are drawn whole, and stretches that are drawn near
 MOST_SPANS = 400  # spans of one reason that are drawn, and pieces of a line before it is thinned
-AROUND, AROUND_SHARE = 25, 0.6  # rows beside a detail, or this share of its length
+ROWS_AROUND, AROUND_SHARE = 25, 0.6  # rows beside a detail, or this share of its length
 
 
 def trends(found: Screened) -> Canvas:
     """Every signal over time: what is kept as a line, rows left out shaded by reason, bad readings as ticks below."""
     tags = [t for t in found.report.tags if t.role != "mode"][:MOST_PANELS]
     with rc_context(STYLE):
-        canvas = Canvas(figsize=(SIZE[0] * 1.25, HEAD + PANEL * len(tags)), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0] * 1.25, HEAD_INCHES + TREND_INCHES * len(tags)), layout="constrained")
         panels = canvas.subplots(len(tags), 1, sharex=True, squeeze=False)[:, 0]
         times = times_of(found)
         seen: set[Reason] = set()
@@ -124,7 +124,7 @@ def _trend(axes: Axes, found: Screened, tag: TagReport, times: ExportTimes) -> s
         pad = 0.08 * (high - low) or 1.0
         axes.set_ylim(low - 2 * pad, high + pad)
     bad = np.flatnonzero((series.code > 0) & (series.code != Reason.DUPLICATE))
-    bad = bad[:: max(1, len(bad) // POINTS)]
+    bad = bad[:: max(1, len(bad) // LINE_POINTS)]
     for reason in np.unique(series.code[bad]):
         own = bad[series.code[bad] == reason]
         x = times.at(series.time_s[own])
@@ -150,7 +150,7 @@ def details(found: Screened) -> Canvas | None:
         return None
     rows = (len(wanted) + 1) // 2
     with rc_context(STYLE):
-        canvas = Canvas(figsize=(SIZE[0] * 1.25, 0.3 + 2.0 * rows), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0] * 1.25, 0.3 + 2.0 * rows), layout="constrained")
         panels = canvas.subplots(rows, 2, squeeze=False).ravel()
         for axes, (tag, reason) in zip(panels, wanted, strict=False):
             _detail(axes, found, tag, reason)
@@ -166,7 +166,7 @@ def _detail(axes: Axes, found: Screened, tag: TagReport, reason: Reason) -> None
     start, end = runs_of(series.code == reason if raw else grid.code[tag.tag] == reason)
     longest = int(np.argmax(end - start))
     a, b = int(start[longest]), int(end[longest]) - 1
-    around = max(AROUND, int(AROUND_SHARE * (b - a)))
+    around = max(ROWS_AROUND, int(AROUND_SHARE * (b - a)))
     first, last = times[max(a - around, 0)], times[min(b + around, len(times) - 1)]
     near = (series.time_s >= first) & (series.time_s <= last)
     source, values, codes = series.time_s, series.value, series.code
@@ -200,7 +200,7 @@ def readings(found: Screened) -> Canvas:
     """Bad readings of every tag by reason, in percent of its readings."""
     tags = list(found.report.tags)
     with rc_context(STYLE):
-        canvas = Canvas(figsize=(SIZE[0] * 1.25, HEAD + 0.6 + 0.32 * len(tags)), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0] * 1.25, HEAD_INCHES + 0.6 + 0.32 * len(tags)), layout="constrained")
         axes = canvas.subplots()
         left = np.zeros(len(tags))
         seen: set[Reason] = set()
@@ -239,10 +239,10 @@ def _shade(axes: Axes, at: Array, code: NDArray[np.uint8]) -> set[Reason]:
 
 
 def _thinned(x: Array, y: Array) -> tuple[Array, Array]:
-    """At most about 2 POINTS points with the same extremes."""
-    if len(x) <= 2 * POINTS:
+    """At most about 2 LINE_POINTS points with the same extremes."""
+    if len(x) <= 2 * LINE_POINTS:
         return x, y
-    block = len(x) // POINTS
+    block = len(x) // LINE_POINTS
     n = len(x) // block * block
     shaped = y[:n].reshape(-1, block)
     empty = np.isnan(shaped).all(axis=1)

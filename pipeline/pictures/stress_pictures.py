@@ -13,7 +13,7 @@ from loopwright.pipeline.pictures.drawing import STYLE, scale, signal_label, sym
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.simulate import Trajectory
 
-PANELS, COLUMNS, TICKS = 6, 3, 4  # of a picture, in a row of it, and of an axis
+PANELS, COLUMNS, AXIS_TICKS = 6, 3, 4  # of a picture, in a row of it, and of an axis
 BLUE, RED, GREY, GOLD = "#0072b2", "#d55e00", "#7f7f7f", "#e69f00"
 
 
@@ -89,7 +89,7 @@ def growth_canvas(growths: list[Growth]) -> Canvas | None:
             elif set(growth.at) == {0.0, 1.0}:
                 axes.set_xticks(at, ["no", "yes"])
             else:
-                axes.xaxis.set_major_locator(MaxNLocator(TICKS))
+                axes.xaxis.set_major_locator(MaxNLocator(AXIS_TICKS))
             axes.set_title(symbol(growth.name) if " " not in growth.name else growth.name)
             axes.margins(0.1)
         every = np.concatenate([np.array([*g.median, *g.high]) for g in shown])

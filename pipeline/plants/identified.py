@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.plants.simulator import AdvanceMany, Array, Signals, Simulator
 
-SETTLE = 2000
+START_REST_PERIODS = 2000
 """Periods that the plant is given to come to rest at its start; a slower one is brought there by Newton's method."""
 
-STILL = 1e-10
+STATE_CHANGE = 1e-10
 """Change of the scaled state in a period that is none."""
 
-NEWTON, SINGULAR, NEWTON_WITHIN = 12, 1e6, 10.0
+NEWTON_STEPS, NEWTON_SINGULAR, NEWTON_WITHIN = 12, 1e6, 10.0
 """Steps; condition of their equations beyond which a plant integrates; scaled outputs beyond which none is at rest."""
 
 
@@ -127,23 +127,23 @@ class IdentifiedPlant(Simulator):
     def _rest(self) -> Array:
         seen = np.zeros(len(self.arrays.y_scale))
         start = x = self.arrays.rest @ np.concatenate([seen, self._v0, [1.0]])
-        for _ in range(SETTLE):
+        for _ in range(START_REST_PERIODS):
             before, x = x, self.arrays.advance(x, self._v0)
             if not np.all(np.abs(x) < 1e3):
                 break
-            if np.max(np.abs(x - before)) < STILL:
+            if np.max(np.abs(x - before)) < STATE_CHANGE:
                 return x
         found = self._rest_near(x)
         return np.concatenate([seen, start[len(seen) :]]) if found is None else found
 
     def _rest_near(self, x: Array) -> Array | None:
         """The rest (n_x,) that a slow plant was on its way to; None where it integrates, or would rest far outside."""
-        for _ in range(NEWTON):
+        for _ in range(NEWTON_STEPS):
             ahead = self.arrays.advance(x, self._v0)
             gap = np.eye(len(x)) - self.arrays.slope(x, self._v0)
-            if not np.all(np.isfinite(ahead)) or np.linalg.cond(gap) > SINGULAR:
+            if not np.all(np.isfinite(ahead)) or np.linalg.cond(gap) > NEWTON_SINGULAR:
                 return None
-            if np.max(np.abs(ahead - x)) < STILL:
+            if np.max(np.abs(ahead - x)) < STATE_CHANGE:
                 far = np.max(np.abs(x[: len(self.arrays.y_scale)]))
                 returns = np.max(np.abs(np.linalg.eigvals(np.eye(len(x)) - gap))) < 1
                 return x if returns and far < NEWTON_WITHIN else None

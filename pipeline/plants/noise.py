@@ -9,8 +9,8 @@ from scipy.linalg import solveh_banded
 
 from loopwright.pipeline.plants.simulator import Array
 
-CERTAIN = 3.0  # standard errors by which the changes of a signal turn back before that is called noise
-LEAST_ROWS = 20  # of a stretch
+TURN_BACK_ERRORS = 3.0  # standard errors by which the changes of a signal turn back before that is called noise
+LEAST_STRETCH = 20  # of a stretch
 LEAST_CHANGE = 1e-3  # of the noise: a level that never moved would be wrong for good
 
 
@@ -41,19 +41,20 @@ def noise_and_change(stretches: Sequence[Array]) -> tuple[Array, Array]:
         s(k) = d(k) + n(k),   var n = c_2 - c_1,   var Dd = c_0 - 2 var n,   c_j = mean of Ds(k) Ds(k+j)
 
     with the differences D from row to row. Noise makes each change turn back in the next one; so does all of the
-    signal's own motion that is gone a row later, which nobody can act on. A change by no more than ``CERTAIN`` standard
-    errors is none, and has no noise. The signal's own change is no less than one standard error or ``LEAST_CHANGE`` of
-    the noise, for the record leaves so much open. Stretches shorter than ``LEAST_ROWS`` say nothing.
+    signal's own motion that is gone a row later, which nobody can act on. A change by no more than ``TURN_BACK_ERRORS``
+    standard errors is none, and has no noise. The signal's own change is no less than one standard error or
+    ``LEAST_CHANGE`` of the noise, for the record leaves so much open. Stretches shorter than ``LEAST_STRETCH`` say
+    nothing.
     """
     width = stretches[0].shape[1] if stretches else 0
-    changes = [np.diff(s, axis=0) for s in stretches if len(s) >= LEAST_ROWS]
+    changes = [np.diff(s, axis=0) for s in stretches if len(s) >= LEAST_STRETCH]
     if not changes:
         return np.zeros(width), np.zeros(width)
     own = np.concatenate([c[:-2] ** 2 for c in changes])
     turned = np.concatenate([c[:-2] * (c[2:] - c[1:-1]) for c in changes])
     roots = np.sqrt(len(turned))
     noise, error = turned.mean(axis=0), turned.std(axis=0) / roots
-    noise = np.where(noise > CERTAIN * error, np.minimum(noise, own.mean(axis=0) / 2), 0.0)
+    noise = np.where(noise > TURN_BACK_ERRORS * error, np.minimum(noise, own.mean(axis=0) / 2), 0.0)
     left = own - 2 * np.where(noise > 0, turned, 0.0)
     least = np.maximum(left.std(axis=0) / roots, LEAST_CHANGE**2 * noise)
     return np.sqrt(noise), np.sqrt(np.maximum(own.mean(axis=0) - 2 * noise, least))

@@ -8,15 +8,15 @@ import numpy as np
 
 from loopwright.pipeline.plants.simulator import AdvanceMany, Array, Simulator
 
-SURE = 2.0  # standard deviations of what a record leaves open
+LEFT_OPEN_SDS = 2.0  # standard deviations of what a record leaves open
 
 
 def likely_error(sd: Array, least: float, most: float) -> Array:
-    """How far (n,) a plant may be off its model: ``SURE`` standard deviations, within ``least`` and ``most``.
+    """How far (n,) a plant may be off its model: ``LEFT_OPEN_SDS`` standard deviations, within ``least`` and ``most``.
 
     The least, as a plant does not stay as its record found it; the most, as beyond it a record tells nothing.
     """
-    return np.clip(SURE * sd, least, most)
+    return np.clip(LEFT_OPEN_SDS * sd, least, most)
 
 
 class SpoiltPlant(Simulator):

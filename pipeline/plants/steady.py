@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.manifest import Signal
 
-GRID = 800  # points of the curve over the set point's range
+CURVE_POINTS = 800  # points of the curve over the set point's range
 STARTS = 60  # random starts for the first point of the curve
 
 
@@ -75,7 +75,7 @@ class SteadyStates:
         rows: list[tuple[float, Array, float]] = []
         guess = None
         # From the top: where one end of the range has no steady state, the other end mostly has one.
-        for cv in np.linspace(self.range.high, self.range.low, GRID + 2)[1:-1]:
+        for cv in np.linspace(self.range.high, self.range.low, CURVE_POINTS + 2)[1:-1]:
             solved = self.at(float(cv), guess)
             if solved is not None:
                 guess = solved

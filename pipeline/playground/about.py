@@ -18,7 +18,7 @@ from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.serving.controller import Controller
 from loopwright.serving.manifest import Signal
 
-SHARE = 0.2  # a slider goes so far to both sides of a parameter's value
+SLIDER_SHARE = 0.2  # a slider goes so far to both sides of a parameter's value
 MIDDLE_SPAN = 1.0  # of a slider whose parameter is 0
 
 
@@ -58,7 +58,7 @@ def _parameters(case: Case, plant: EquationPlant, tests: Mapping[str, Scenario])
 
 
 def _around(value: float, moved: Sequence[float]) -> tuple[float, float]:
-    span = SHARE * abs(value) or MIDDLE_SPAN
+    span = SLIDER_SHARE * abs(value) or MIDDLE_SPAN
     return min(value - span, *moved, value), max(value + span, *moved, value)
 
 

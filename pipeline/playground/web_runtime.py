@@ -24,7 +24,7 @@ DIGESTS = {
 }
 NPM = Path(__file__).parent / "npm"
 LICENCE = NPM / "onnxruntime-LICENSE"
-PATIENCE_S = 600.0  # [s] that npm may take
+NPM_PATIENCE_S = 600.0  # [s] that npm may take
 
 
 def kept() -> Path:
@@ -76,9 +76,9 @@ def _fetch(folder: Path) -> None:
         # Without scripts: nothing that is fetched is run here.
         command = [npm, "ci", "--prefix", place, "--ignore-scripts", "--no-audit", "--no-fund"]
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+            done = subprocess.run(command, capture_output=True, text=True, timeout=NPM_PATIENCE_S, check=False)
         except subprocess.TimeoutExpired:
-            raise PipelineError(f"npm took more than {PATIENCE_S:g} s; try again, {elsewhere}") from None
+            raise PipelineError(f"npm took more than {NPM_PATIENCE_S:g} s; try again, {elsewhere}") from None
         if done.returncode:
             said = [line for line in done.stderr.splitlines() if line.strip()] or ["no reason given"]
             raise PipelineError(f"npm cannot fetch onnxruntime-web: {said[0]}; try again, {elsewhere}")

@@ -221,9 +221,9 @@ def check_mv(table: Table, signal: Signal, mv: Array) -> None:
         )
 
 
-MOST = 3  # levels at most of an input that counts as one of few levels
-NEAR = 1e-3  # of the span: values of one level
-ROWS = 0.99  # of the rows at the levels; a mean over a period in which the input was moved lies between two
+MOST_FEW_LEVELS = 3  # levels at most of an input that counts as one of few levels
+SAME_LEVEL = 1e-3  # of the span: values of one level
+LEVEL_ROWS = 0.99  # of the rows at the levels; a mean over a period in which the input was moved lies between two
 
 
 def levels_of(values: Array) -> tuple[float, ...]:
@@ -234,11 +234,11 @@ def levels_of(values: Array) -> tuple[float, ...]:
     span = float(np.ptp(values)) if values.size else 0.0
     if span <= 0:
         return ()
-    place, count = np.unique(np.round((values - values.min()) / (NEAR * span)), return_counts=True)
-    first = np.argsort(-count, kind="stable")[:MOST]
+    place, count = np.unique(np.round((values - values.min()) / (SAME_LEVEL * span)), return_counts=True)
+    first = np.argsort(-count, kind="stable")[:MOST_FEW_LEVELS]
     for n in range(2, len(first) + 1):
-        if count[first[:n]].sum() >= ROWS * len(values):
-            return tuple(float(values.min() + NEAR * span * p) for p in np.sort(place[first[:n]]))
+        if count[first[:n]].sum() >= LEVEL_ROWS * len(values):
+            return tuple(float(values.min() + SAME_LEVEL * span * p) for p in np.sort(place[first[:n]]))
     return ()
 
 

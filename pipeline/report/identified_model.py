@@ -72,10 +72,10 @@ def _answer(left: Levels | None, drifts: bool) -> str:
 
 
 # --------------------------------------------------------------------------------------------------------- the section
-MOST_TRIED = 12  # candidates in the table, the best first
+MOST_CANDIDATES = 12  # candidates in the table, the best first
 COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white
-OF_NOISE = 1.1  # error over the noise: no model is nearer
-ANSWERED = 0.1  # of the steepest slope: from here on an output answers
+NEAREST_ERROR = 1.1  # error over the noise: no model is nearer
+ANSWERING_SLOPE = 0.1  # of the steepest slope: from here on an output answers
 APART = 2  # periods between likely dead times from which on the report asks for the true one
 SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
 
@@ -264,17 +264,17 @@ def answers_after(curve: Mapping[str, Any], dead: float = 0.0) -> float:
     """Periods from the step to the first sample of a step response that differs by it: one more than the dead time.
 
     The line through the first point beyond doubt, as steep as the response there or as it becomes next, begins one
-    sample before the answer. A point is beyond doubt where its slope is more than ANSWERED of the steepest, and its
-    value more than half of the steepest change in a period and than the band of the fits. It does not matter how
-    long the response is or whether it ends, and its points may lie several periods apart. Never earlier than after
-    the ``dead`` periods of the model; 0 where nothing answers.
+    sample before the answer. A point is beyond doubt where its slope is more than ANSWERING_SLOPE of the steepest, and
+    its value more than half of the steepest change in a period and than the band of the fits. It does not matter how
+    long the response is or whether it ends, and its points may lie several periods apart. Never earlier than after the
+    ``dead`` periods of the model; 0 where nothing answers.
     """
     at = np.array([curve["periods"][0] - 1, *curve["periods"]], dtype=np.float64)
     size = np.array([0.0, *curve["middle"]])
     width = np.array(curve["high"]) - np.array(curve["low"]) if "high" in curve else np.zeros(len(size) - 1)
     slope = np.diff(size) / np.diff(at)
     steep = np.abs(slope)
-    sure = (steep > ANSWERED * steep.max()) & (np.abs(size[1:]) > np.maximum(width, 0.5 * steep.max()))
+    sure = (steep > ANSWERING_SLOPE * steep.max()) & (np.abs(size[1:]) > np.maximum(width, 0.5 * steep.max()))
     if not sure.any():
         return 0.0
     k = int(sure.argmax())
@@ -287,7 +287,7 @@ def answers_after(curve: Mapping[str, Any], dead: float = 0.0) -> float:
 
 def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
     tried = [row for row in part.get("candidates_tried") or () if row.get("error") is not None]
-    best = sorted(tried, key=lambda row: float(row["error"]))[:MOST_TRIED]
+    best = sorted(tried, key=lambda row: float(row["error"]))[:MOST_CANDIDATES]
     chosen = [row for row in tried if row.get("chosen") and row not in best]
     return tuple(
         (
@@ -308,7 +308,7 @@ def _fit(found: Mapping[str, Any]) -> str:
     fit, error, noise = (found.get(key) for key in ("fit_percent", "free_run_rmse", "noise_sd"))
     if fit is None:
         return "the run explodes"
-    good = error is not None and noise is not None and error <= OF_NOISE * noise
+    good = error is not None and noise is not None and error <= NEAREST_ERROR * noise
     return f"{fit:.3g} %{', as good as the noise' if good else ''}"
 
 

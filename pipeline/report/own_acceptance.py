@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from loopwright.pipeline.evaluation.closed_loop import FAR
+from loopwright.pipeline.evaluation.closed_loop import UNREACHED_ERROR
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import lock_up_text
 from loopwright.pipeline.evaluation.metric import NO_UNIT
@@ -14,7 +14,7 @@ from loopwright.pipeline.evaluation.poor_laws import worst_cycle
 from loopwright.pipeline.evaluation.proof import known_rows, statements
 from loopwright.pipeline.evaluation.validation import CheckedStatement
 from loopwright.pipeline.historian.settling import in_words
-from loopwright.pipeline.historian.step_test import ALONE, HOLDS, LARGEST, MOVES
+from loopwright.pipeline.historian.step_test import ALONE, HOLD_SETTLINGS, LARGEST_AMPLITUDE, RANDOM_MOVES
 from loopwright.pipeline.pictures.drawing import axis_label
 from loopwright.pipeline.pictures.numbers import number, times
 from loopwright.pipeline.pictures.words import law_name, scenario_name
@@ -145,14 +145,16 @@ def step_test_to_run(evidence: Evidence) -> str:
     if evidence.grounds is not None and evidence.grounds.doubt:
         return f"{old}A step test gives a better model: run that of step_test.csv, which `loopwright new` wrote. {rows}"
     units = {s.name: "" if s.unit in NO_UNIT else f" {s.unit.replace('deg', '°')}" for s in case.record_signals.mv}
-    steps = [f"{s.name} by {number(LARGEST * (s.high - s.low))}{units[s.name]}" for s in case.record_signals.mv]
-    alone, least, most = (share * case.settling_s for share in (ALONE, min(HOLDS), max(HOLDS)))
-    whole = 3 * len(steps) * alone + MOVES * sum(HOLDS) / len(HOLDS) * case.settling_s
+    steps = [
+        f"{s.name} by {number(LARGEST_AMPLITUDE * (s.high - s.low))}{units[s.name]}" for s in case.record_signals.mv
+    ]
+    alone, least, most = (share * case.settling_s for share in (ALONE, min(HOLD_SETTLINGS), max(HOLD_SETTLINGS)))
+    whole = 3 * len(steps) * alone + RANDOM_MOVES * sum(HOLD_SETTLINGS) / len(HOLD_SETTLINGS) * case.settling_s
     each, them = (", each alone", "all of them") if steps[1:] else ("", "it")
     return (
         f"{old}A step test gives a better model: move in manual {', '.join(steps)} to each side, or as much more as "
-        f"the plant bears{each}: up, down and back, each held for {in_words(alone)}. Then move {them} {MOVES} times at "
-        f"random within that, held for {in_words(least)} to {in_words(most)}; {in_words(whole)} in all. {rows}"
+        f"the plant bears{each}: up, down and back, each held for {in_words(alone)}. Then move {them} {RANDOM_MOVES} "
+        f"times at random within that, held for {in_words(least)} to {in_words(most)}; {in_words(whole)} in all. {rows}"
     )
 
 
@@ -165,7 +167,8 @@ def _lock_ups(name: str, evidence: Evidence) -> CheckedStatement:
 def _settles(evidence: Evidence, law: str) -> CheckedStatement:
     """The largest error at the end of a hold, in the test where it is largest."""
     cvs = evidence.case.plant_class.sp_signals
-    limit = FAR * (cvs[0].high - cvs[0].low if len(cvs) == 1 else 100.0)  # of several CVs errors are in % of ranges
+    # of several CVs errors are in % of ranges
+    limit = UNREACHED_ERROR * (cvs[0].high - cvs[0].low if len(cvs) == 1 else 100.0)
     found = {name: evidence.figure(law, name, "max_asse") for name in evidence.scenarios if name not in evidence.daily}
     ends = {name: value for name, value in found.items() if value is not None}
     worst = max(ends, key=lambda name: ends[name], default=None)
@@ -174,7 +177,7 @@ def _settles(evidence: Evidence, law: str) -> CheckedStatement:
         f"≤ {_with_unit(evidence, limit)}",
         UNMEASURED if worst is None else f"{_with_unit(evidence, ends[worst])} in test {worst}",
         None if worst is None else ends[worst] <= limit,
-        f"{100 * FAR:g} % of the range: a loop with more has not reached its set point",
+        f"{100 * UNREACHED_ERROR:g} % of the range: a loop with more has not reached its set point",
     )
 
 

@@ -19,8 +19,8 @@ from loopwright.pipeline.evaluation.validation import FILE, Validation
 from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.simulation import NOISE_SUFFIX
 
-WIDTH = 120  # letters of the table, where no terminal says how wide it is
-AHEAD = 0.99  # ratio to the bound below which a remark says why
+RESULTS_WIDTH = 120  # letters of the table, where no terminal says how wide it is
+REMARK_RATIO = 0.99  # ratio to the bound below which a remark says why
 LONGEST_HEADS = 40  # letters of the names of laws side by side that a line of 80 has room for, beside the tests
 
 
@@ -32,7 +32,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
     console = console or Console()
     if not console.is_terminal:
         # A log has no width; a fixed one keeps the table whole.
-        console = Console(file=console.file, width=WIDTH)
+        console = Console(file=console.file, width=RESULTS_WIDTH)
     folders = sorted(path.parent for path in artifacts.glob("*/validation.json"))
     if not folders:
         raise PipelineError(
@@ -215,7 +215,7 @@ def _size(law: LawStanding) -> str:
 
 def _ahead(law: LawStanding) -> bool:
     """Whether a law's figure is below the bound by more than its digits show as 1."""
-    return law.ratio is not None and law.ratio < AHEAD
+    return law.ratio is not None and law.ratio < REMARK_RATIO
 
 
 def _multiple(standing: CaseStanding, law: LawStanding) -> str:

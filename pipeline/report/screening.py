@@ -11,8 +11,8 @@ from matplotlib.figure import Figure as Canvas
 from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.files import write_text
 from loopwright.pipeline.historian.cleaning.findings import InputReport, RecordJudgement
-from loopwright.pipeline.historian.excitation import HELD
 from loopwright.pipeline.historian.files.quality import Reason
+from loopwright.pipeline.historian.files.signal_statistics import HELD_ROWS
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.historian.step_test import StepTest
 from loopwright.pipeline.pictures.drawing import axis_label, png, ratio_unit
@@ -75,7 +75,7 @@ def sayings(verdict: RecordJudgement, units: Mapping[str, str], known: Collectio
             words = [by_one if gain else "gain not clear" if rate is None else _ramp(rate, units.get(pv, ""), i.unit)]
             hidden = f"or settles slowly: {i.name} follows {pv}, which hides the difference"
             words += [hidden] if rate is not None and not gain and pv in i.against else []
-            seldom = ", as it seldom rests" * (i.held_share < HELD)
+            seldom = ", as it seldom rests" * (i.held_share < HELD_ROWS)
             words += [f"first answer not seen{seldom}" if first is None else _after(first, i.first_possible_s[pv])]
             words += [_settles(i, pv)] if gain else []
             words += ["gain and settling unreliable: drift or loads"] if gain and pv in verdict.unsure else []

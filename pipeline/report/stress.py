@@ -10,7 +10,7 @@ from typing import Any
 
 from loopwright.pipeline.evaluation.stress.draws import KINDS, MOST_SPAN, MOST_ZERO, STROKE, STUCK_FOR, Draw
 from loopwright.pipeline.evaluation.stress.loops import Stress, StressOutcome
-from loopwright.pipeline.evaluation.stress.summary import QUANTILES, Summary, table
+from loopwright.pipeline.evaluation.stress.summary import LOOP_QUANTILES, Summary, table
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.pictures.drawing import save
 from loopwright.pipeline.pictures.numbers import number
@@ -70,7 +70,7 @@ def write_stress(run: StressRun, out: Path) -> list[Path]:
         "faults": 100 * drawing.faults,
         "counts": summary.counts,
         "shares": {k: 100 * v / len(summary.outcomes) for k, v in summary.counts.items()},
-        "quantiles": [f"{100 * q:g} %" if q < 1 else "worst" for q in QUANTILES],
+        "quantiles": [f"{100 * q:g} %" if q < 1 else "worst" for q in LOOP_QUANTILES],
         "spreads": [(case.label(s.metric), s.test or "all", s.loops, s.values) for s in summary.spreads()],
         "requirements": [
             (case.label(need.metric), need.scenario, need.low, need.high, met.loops, 100 * met.share)

@@ -24,7 +24,7 @@ from loopwright.pipeline.pictures.words import curve_label, law_name
 from loopwright.pipeline.report.own_acceptance import own_acceptance
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
-FINE = 5  # digits shown of a figure that has to be near
+NEAR_DIGITS = 5  # digits shown of a figure that has to be near
 RULE = (
     f"A figure reproduces if it differs from the paper's by at most {100 * RELATIVE:g} %, by at most {ABSOLUTE:g} in "
     "its unit, or by at most the tolerance in its row. Our figures are medians over the data seeds; the models of each "
@@ -79,7 +79,7 @@ def table_row(row: PaperFigure, evidence: Evidence, reason: Reason) -> TableRow:
         verdict = "reproduces" + ("" if row.within is None else f" within {row.within:.2g}")
     else:
         verdict = f"does not, because {reason(row, ours, evidence)}"
-    metric, digits = evidence.case.label(row.metric), 3 if row.within is None else FINE
+    metric, digits = evidence.case.label(row.metric), 3 if row.within is None else NEAR_DIGITS
     return TableRow(row.label, metric, row.paper, ours, low, high, verdict, holds, digits)
 
 

@@ -20,7 +20,7 @@ from loopwright.serving.guard import Sample
 from loopwright.serving.manifest import Signal
 
 WINDOW_S = 60.0  # [s] of the course that is shown
-WIDTH = 60  # letters of a course
+COURSE_WIDTH = 60  # letters of a course
 BARS = "▁▂▃▄▅▆▇█"
 Show = Callable[[float, str, Array, str, str | None], None]
 """``show(time_s, mode, values, reason, mark)`` shows one scan: set points, PVs and MVs in ``values``, what was wrong
@@ -138,7 +138,7 @@ class TerminalView:
         return Group(head, table, *(Text(event, style="dim") for event in self.events))
 
 
-def sparkline(values: Array, low: float, high: float, width: int = WIDTH) -> str:
+def sparkline(values: Array, low: float, high: float, width: int = COURSE_WIDTH) -> str:
     """The values as bars over [low, high], the newest at the right end; the mean where several share a bar."""
     groups = np.array_split(values, min(width, len(values)))
     share = (np.array([group.mean() for group in groups]) - low) / (high - low)

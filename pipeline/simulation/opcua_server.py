@@ -31,7 +31,7 @@ LOCAL, REMOTE = 0, 1  # who has the plant: its own controller, or whoever writes
 LEASE = "LoopwrightLease"  # its browse name, by which loops find it beside the MVs
 ALIVE_PERIODS = 3  # periods without a heartbeat after which a loop counts as gone
 WATCHDOG = "Control.Watchdog"
-PARTS, LEAST_PART_S = 10, 0.025  # a period has so many parts at most, each at least as long by the clock
+PERIOD_PARTS, LEAST_PART_S = 10, 0.025  # a period has so many parts at most, each at least as long by the clock
 KINDS = {"LREAL": ua.VariantType.Double, "REAL": ua.VariantType.Float}
 
 
@@ -281,7 +281,7 @@ class PlantServer:
 
 def in_parts(plant: Simulator, period_s: float) -> tuple[int, Advance]:
     """In how many parts a plant goes through a period of ``period_s`` by the clock, and its step over one of them."""
-    n = min(PARTS, int(period_s / LEAST_PART_S))
+    n = min(PERIOD_PARTS, int(period_s / LEAST_PART_S))
     if not isinstance(plant, EquationPlant) or n < 2:
         return 1, plant.step
     steps = math.ceil(plant.substeps / n)

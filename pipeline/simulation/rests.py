@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 from loopwright.pipeline.plants.simulator import Array, Simulator
 
 RESTING = 2_000  # periods that a plant is given to come to rest
-LOOK = 100  # periods between two looks whether it has
-STILL = 1e-7  # of the largest state: a change in one period that is none
+REST_LOOK = 100  # periods between two looks whether it has
+STILL_STATE = 1e-7  # of the largest state: a change in one period that is none
 BROKEN = 1e9  # a state beyond it belongs to a plant that runs away
 CHANGE = 1e-6  # of a state or of an MV's range: for slopes
-NEWTON = 12  # iterations
+REST_ITERATIONS = 12  # iterations
 BALANCED = 1e-6  # largest residual of a balance that was found
-STEP = 0.02  # of an MV's range: for local gains
-MOVING = 0.2  # of a difference, over RESTING periods at its late rate: a CV that moves more does not settle
-WEAK = 1e-7  # of the largest slope: a direction in which nothing is decided
+LOCAL_GAIN_STEP = 0.02  # of an MV's range: for local gains
+# of a difference, over RESTING periods at its late rate: a CV that moves more does not settle
+NEVER_SETTLES = 0.2
+WEAK_SLOPE = 1e-7  # of the largest slope: a direction in which nothing is decided
 
 
 def courses(plant: Simulator, x0: Array, mvs: Array, n: int, p: Array | None = None) -> Array:
@@ -39,10 +40,10 @@ def settled(plant: Simulator, x0: Array, mvs: Array, p: Array | None = None) -> 
     """States (runs, n_x) after at most ``RESTING`` periods from x0 (n_x,) under constant mvs (runs, n_mv)."""
     advance = plant.many(len(mvs), p)
     x = np.tile(x0, (len(mvs), 1))
-    for _ in range(RESTING // LOOK):
-        for _ in range(LOOK):
+    for _ in range(RESTING // REST_LOOK):
+        for _ in range(REST_LOOK):
             before, x = x, _bounded(x, advance(x, mvs))
-        if np.max(np.abs(x - before)) <= STILL * max(float(np.max(np.abs(x))), 1.0):
+        if np.max(np.abs(x - before)) <= STILL_STATE * max(float(np.max(np.abs(x))), 1.0):
             break
     return x
 
@@ -67,13 +68,13 @@ def local_gains(plant: Simulator, mv: int, places: Array, middle: Array, n_cv: i
     Central differences of rests. Where a CV does not settle under the two MVs of a difference, its gain is the rate at
     which they part, in CV a period.
     """
-    size = STEP * (plant.mv_signals[mv].high - plant.mv_signals[mv].low)
+    size = LOCAL_GAIN_STEP * (plant.mv_signals[mv].high - plant.mv_signals[mv].low)
     pairs = np.tile(middle, (2, len(places), 1))
     pairs[0, :, mv], pairs[1, :, mv] = places + size, places - size
     y = courses(plant, plant.start[0], pairs.reshape(-1, len(middle)), RESTING)[..., :n_cv]
     apart = (y[: len(places)] - y[len(places) :]) / (2 * size)  # (places, samples, n_cv)
     late = (apart[:, -1] - apart[:, -RESTING // 4]) / (RESTING // 4 - 1)
-    moving = np.abs(late) * RESTING > MOVING * np.abs(apart[:, -1])
+    moving = np.abs(late) * RESTING > NEVER_SETTLES * np.abs(apart[:, -1])
     return np.where(moving, late, apart[:, -1]), moving
 
 
@@ -93,7 +94,7 @@ def balanced(
     x, mv = np.array(x, dtype=np.float64), np.array(mv, dtype=np.float64)
     many = plant.many(n_x + len(mv) + 1, p)
     away = np.inf
-    for _ in range(NEWTON):
+    for _ in range(REST_ITERATIONS):
         size = np.concatenate([CHANGE * np.maximum(np.abs(x), 1.0), CHANGE * span])
         z = np.concatenate([x, mv]) + np.vstack([np.zeros(n_x + len(mv)), np.diag(size)])
         gap = np.column_stack([many(z[:, :n_x], z[:, n_x:]) - z[:, :n_x], plant.measured(z[:, :n_x])[:, index]])
@@ -104,7 +105,7 @@ def balanced(
         slope = ((gap[1:] - gap[0]) / size[:, None]).T
         # MVs count by their range, so that of all balances the nearest one is taken.
         weight = np.concatenate([np.ones(n_x), span])
-        step = np.linalg.lstsq(slope * weight, -gap[0], rcond=WEAK)[0] * weight
+        step = np.linalg.lstsq(slope * weight, -gap[0], rcond=WEAK_SLOPE)[0] * weight
         x, mv = x + step[:n_x], mv + step[n_x:]
     return x, mv, away
 

@@ -21,15 +21,22 @@ import numpy as np
 
 from loopwright.pipeline.engine.parallel import as_done
 from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.evaluation.metric import mean_of_draws
+from loopwright.pipeline.evaluation.metric import DRAW_SEEDS, mean_of_draws
 from loopwright.pipeline.files import write_text
-from loopwright.pipeline.optimal.bounds import DEFAULTS, SCHEMA, bounded, bounds_path, kinds, problem, read_stored
+from loopwright.pipeline.optimal.bounds import (
+    BOUNDS_SCHEMA,
+    DEFAULTS,
+    bounded,
+    bounds_path,
+    kinds,
+    problem,
+    read_stored,
+)
 from loopwright.pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
 from loopwright.pipeline.plants.equations import equations
 from loopwright.pipeline.simulation.scenario import Scenario
 
-NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW for every further draw
-DRAW = 1_000  # seeds between two draws of a test's noise
+NOISE_SEED = 20_000  # plus the index of the sequence, and DRAW_SEEDS for every further draw
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +55,7 @@ def _compute(case: Case, job: Job) -> tuple[Job, dict[str, dict[str, float]], fl
     first = job.kinds[0]
     nmpc = PerfectNmpc(plant, criterion, case.effort, case.limits)
     noise, draws = (case.noise_std.tolist(), case.noise_draws) if first == "nmpc_noise" else (None, 1)
-    seeds = [NOISE_SEED + job.index + DRAW * draw for draw in range(draws)]
+    seeds = [NOISE_SEED + job.index + DRAW_SEEDS * draw for draw in range(draws)]
     know = (ahead, case.unforeseen, case.score)
     figures = {first: mean_of_draws(run_nmpc(nmpc, job.scenario, noise, seed, *know) for seed in seeds)}
     if "offline" in job.kinds:
@@ -84,7 +91,7 @@ def compute(case: Case, names: list[str], path: Path | None = None) -> Iterator[
     path = path or bounds_path(case)
     stored, current, noisy_too = read_stored(path), problem(case), "nmpc_noise" in kinds(case)
     if any((DEFAULTS | stored).get(key) != value for key, value in current.items()):
-        stored = {"schema": SCHEMA, "case": case.name, **current, "figures": {}}
+        stored = {"schema": BOUNDS_SCHEMA, "case": case.name, **current, "figures": {}}
     scenarios = case.tests()
     # What no test can have any more is left out; of random sequences, all are kept.
     stored["figures"] = {

@@ -17,9 +17,9 @@ from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 from loopwright.pipeline.tracking.gate import Gate
 from loopwright.pipeline.tracking.stage_results import StageResult, StageTimes, flat
 
-MOST = 12  # figures of a run: more would hide those that decide
+MOST_NOTED_FIGURES = 12  # figures of a run: more would hide those that decide
 OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")
-POINTS = 200
+TRACKED_POINTS = 200
 """Points of a curve; a training of thousands of iterations is thinned to these."""
 
 Figures = dict[str, float]
@@ -36,7 +36,7 @@ def headline(kind: str, metrics: Mapping[str, Any], validation: Validation | Non
         "report": lambda: _of_case(validation),
     }.get(kind, dict)()
     finite = {name: float(value) for name, value in figures.items() if _is_figure(value)}
-    return dict(list(finite.items())[:MOST])
+    return dict(list(finite.items())[:MOST_NOTED_FIGURES])
 
 
 def ratio_name(validation: Validation | None) -> str:
@@ -125,7 +125,7 @@ def curves(metrics: Mapping[str, Any], sweep: Mapping[str, Any]) -> Iterator[tup
     for part, row in (metrics.get("parts") or {}).items():
         seed: Mapping[str, Any] = next(iter((row.get("per_seed") or {}).values()), {})
         history = seed.get("history") or ()
-        for step in range(0, len(history), max(1, math.ceil(len(history) / POINTS))):
+        for step in range(0, len(history), max(1, math.ceil(len(history) / TRACKED_POINTS))):
             if _is_figure(history[step]):
                 yield f"training/{part}", step, float(history[step])
     for row in sweep.get("rows") or ():

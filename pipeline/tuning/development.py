@@ -19,12 +19,12 @@ from loopwright.pipeline.plants.simulator import Array, Simulator
 LawStep = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 """A control law or its ``forward``: (sp, pv, dv, mv_applied, state) -> (mv, state_next, info)."""
 
-MARGIN = 0.02  # share of the reachable range of the controlled variable that is left out at either end
-TRAVEL = 0.05  # share of the range of the controlled variable that a move over the MV's range costs
-WITHIN = 0.1  # share of an MV's range that is left out at either end when set points are looked for
-LOAD = 0.08  # of an MV's range: the steps of a load that acts with it
-RESTING = 1000  # samples to come to rest
-MOVING = 0.01  # of the set point's range, over the last fifth of them: not at rest
+REACH_MARGIN = 0.02  # share of the reachable range of the controlled variable that is left out at either end
+MOVE_COST = 0.05  # share of the range of the controlled variable that a move over the MV's range costs
+MV_END_MARGIN = 0.1  # share of an MV's range that is left out at either end when set points are looked for
+MV_LOAD = 0.08  # of an MV's range: the steps of a load that acts with it
+DEVELOPMENT_REST = 1000  # samples to come to rest
+NOT_AT_REST = 0.01  # of the set point's range, over the last fifth of them: not at rest
 DRAWN = 8  # rests that are looked for, for each set point
 
 
@@ -86,7 +86,7 @@ class DevelopmentLoops:
         held = cvs[(mvs >= mv.low) & (mvs <= mv.high)]
         if not held.size:
             raise PlantError(f"plant {plant.name!r} has no steady state with {mv.name} in [{mv.low}, {mv.high}]")
-        inset = MARGIN * (held.max() - held.min())
+        inset = REACH_MARGIN * (held.max() - held.min())
         low, high = held.min() + inset, held.max() - inset
         levels = np.array([np.random.default_rng(s).uniform(low, high, set_points) for s in seeds])
         starts = [plant.steady_state_at(float(first)) for first in levels[:, 0]]
@@ -106,7 +106,7 @@ class DevelopmentLoops:
         n, n_cv = set_points * hold, len(plant.sp_signals)
         first = plant.measured(x0)[:n_cv]
         sp, load = np.empty((n, 2 * len(seeds), n_cv)), np.zeros((n, 2 * len(seeds), len(mv0)))
-        size = LOAD * np.array([s.high - s.low for s in plant.mv_signals])
+        size = MV_LOAD * np.array([s.high - s.low for s in plant.mv_signals])
         for i, seed in enumerate(seeds):
             rng = np.random.default_rng(seed)
             sp[:, 2 * i] = np.repeat(_reachable(plant, set_points, rng), hold, axis=0)
@@ -124,15 +124,15 @@ class DevelopmentLoops:
         ``step`` takes shapes (candidates, s, .): a law whose numbers have a leading dimension
         of candidates. The error of a sample counts before that sample's move acts. A candidate
         whose loop is not finite has an infinite error. Several CVs count in shares of their ranges, as their sum.
-        Where the plant has measurement noise, the law is given it, and the error counts ``TRAVEL`` of the MVs' travel,
-        both in shares of their ranges.
+        Where the plant has measurement noise, the law is given it, and the error counts ``MOVE_COST`` of the MVs'
+        travel, both in shares of their ranges.
         """
         n, s, n_cv = self.sp.shape
         plant, sd = self.plant, self.plant.noise_std
         noise = sd * coloured(np.random.default_rng(0).standard_normal((n, s, len(sd))), plant.noise_colour)
         spans = np.array([s.high - s.low for s in plant.sp_signals])
         weights = spans[0] / spans
-        price = TRAVEL * spans[0] / np.array([s.high - s.low for s in plant.mv_signals]) * bool(sd.any())
+        price = MOVE_COST * spans[0] / np.array([s.high - s.low for s in plant.mv_signals]) * bool(sd.any())
         lanes = (candidates, s)
         x0, mv0 = np.tile(self.x0, (candidates, 1)), np.tile(self.mv0, (candidates, 1, 1))
         loops, error = BatchLoops(plant, step, n_state, lanes, x0, mv0), np.zeros(lanes)
@@ -160,7 +160,7 @@ def _reachable(plant: Simulator, set_points: int, rng: np.random.Generator) -> A
     """Set points (set_points, n_cv) at which the plant rests under MVs within their ranges."""
     mv_low, mv_high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
     low, high = plant.asked
-    inset, count, resting = WITHIN * (mv_high - mv_low), DRAWN * set_points, plant.foreseen or RESTING
+    inset, count, resting = MV_END_MARGIN * (mv_high - mv_low), DRAWN * set_points, plant.foreseen or DEVELOPMENT_REST
     mv = rng.uniform(mv_low + inset, mv_high - inset, (count, len(mv_low)))
     x, advance, late = np.tile(plant.start[0], (count, 1)), plant.many(count), np.empty(0)
     with np.errstate(all="ignore"):  # an integrator may run away
@@ -169,7 +169,7 @@ def _reachable(plant: Simulator, set_points: int, rng: np.random.Generator) -> A
             if k == resting - resting // 5:
                 late = plant.measured(x)[:, : len(low)]
     ends = plant.measured(x)[:, : len(low)]
-    restless = np.median(np.abs(ends - late), axis=0) > MOVING * (high - low)
+    restless = np.median(np.abs(ends - late), axis=0) > NOT_AT_REST * (high - low)
     ends = np.where(restless | ~np.isfinite(ends), rng.uniform(low, high, ends.shape), ends)
     # Uniform over the set points' ranges, not over the MVs': each the nearest rest of a point that is drawn there.
     ends = np.clip(ends, low, high)

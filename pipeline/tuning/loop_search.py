@@ -21,9 +21,10 @@ Cost = Callable[[Sequence[Loops]], Array]
 
 SPEEDS = tuple(np.geomspace(0.5, 32.0, 10))  # closed-loop time constants, in dead times and periods
 WEIGHTS = (1.0, 0.7, 0.4)  # set-point weights that are tried first, common to all loops
-GAINS, INTEGRALS = (0.5, 0.7, 1.0, 1.4, 2.0), (0.4, 0.63, 1.0, 1.6, 2.5)  # factors, in the first round
+FIRST_GAINS, FIRST_INTEGRALS = (0.5, 0.7, 1.0, 1.4, 2.0), (0.4, 0.63, 1.0, 1.6, 2.5)  # factors, in the first round
 DERIVATIVES, FILTERS = (0.0, 0.07, 0.15, 0.3), (0.125, 0.5)  # Td of Ti, Tf of Td
-NEAR = (0.8, 0.9, 1.0, 1.11, 1.25)  # factors of gains and integral times about the best ones, in the second round
+# factors of gains and integral times about the best ones, in the second round
+SECOND_FACTORS = (0.8, 0.9, 1.0, 1.11, 1.25)
 FINE_WEIGHTS = (
     0.2,
     0.3,
@@ -65,7 +66,7 @@ def searched(
     if not np.isfinite(best[0]):
         raise LawError("no PID gave a finite closed loop; check the MV's range or tune by hand (`manual`)")
     show(rounds)
-    for gains, integrals in ((GAINS, INTEGRALS), (NEAR, NEAR)):
+    for gains, integrals in ((FIRST_GAINS, FIRST_INTEGRALS), (SECOND_FACTORS, SECOND_FACTORS)):
         for i in range(len(processes)):
             now = best[1][i]
             rows = [replace(now, kc=now.kc * g, ti_s=now.ti_s * t) for g in gains for t in integrals]

@@ -8,7 +8,7 @@ from math import isfinite, sqrt
 from loopwright.pipeline.tuning.rules import PidSettings
 from loopwright.serving.manifest import Signal
 
-WHOLE = 100.0  # whole range of an MV in %
+WHOLE_RANGE = 100.0  # whole range of an MV in %
 
 
 def whole_span(mv: Signal) -> float:
@@ -16,7 +16,7 @@ def whole_span(mv: Signal) -> float:
 
     A control system scales an MV in % from 0 to 100, whatever part of it a record moved or a law may command.
     """
-    return max(WHOLE, mv.high - mv.low) if mv.unit == "%" else mv.high - mv.low
+    return max(WHOLE_RANGE, mv.high - mv.low) if mv.unit == "%" else mv.high - mv.low
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,12 +15,12 @@ from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.plants.steady import Linearization
 
 RANK = 1e-8  # singular values of the Hankel matrix below this share of the largest are rounding
-NOTHING = 1e-14  # a largest one below this share of |C| |B| is nothing at all
+NO_RESPONSE = 1e-14  # a largest one below this share of |C| |B| is nothing at all
 DIFFERENCE = 1e-4  # of a signal's size: the step of the central differences
-ANSWERED = 1e-6  # of its largest move in a period: the CV has begun to answer
-OVERSHOOT = 0.02  # of its end, by which an answer swings beyond it: no lags do
+CV_ANSWERED = 1e-6  # of its largest move in a period: the CV has begun to answer
+LAG_OVERSHOOT = 0.02  # of its end, by which an answer swings beyond it: no lags do
 LONGEST_ANSWER = 20  # mean residence times in which an answer ends
-REST = 1e-6  # of a state's size: what the start may move in one period and count as at rest
+START_AT_REST = 1e-6  # of a state's size: what the start may move in one period and count as at rest
 
 
 def minimal(lin: Linearization, pv: int = 0, mv: int = 0) -> Linearization:
@@ -44,7 +44,7 @@ def minimal(lin: Linearization, pv: int = 0, mv: int = 0) -> Linearization:
     markov = np.array([float((c @ np.linalg.matrix_power(unit_a, k) @ b)[0, 0]) for k in range(2 * n)])
     at = np.arange(n)[:, None] + np.arange(n)
     u, s, vt = np.linalg.svd(markov[at])
-    if not s[0] > NOTHING * float(np.linalg.norm(c) * np.linalg.norm(b)):
+    if not s[0] > NO_RESPONSE * float(np.linalg.norm(c) * np.linalg.norm(b)):
         raise LawError("the MV does not act on the controlled variable of the linearized plant; check the pairing")
     order = int((s > RANK * s[0]).sum())
     if order == n:
@@ -124,7 +124,7 @@ def start_lags(plant: Simulator) -> tuple[Linearization, float]:
     size = np.maximum(np.abs(x0), 1e-3 * max(1.0, float(np.abs(x0).max())))
     moved = np.abs(plant.step(x0, mv0, dv, p) - x0)
     remedy = "tune the controller by hand (`manual`), or give the plant's equations"
-    if not (moved <= REST * size).all():
+    if not (moved <= START_AT_REST * size).all():
         raise PlantError(
             f"plant {plant.name!r} is not at rest at its start: its state moves by up to {moved.max():.3g} in a period "
             f"with the MV held; give a start at rest, {remedy}"
@@ -156,10 +156,10 @@ def start_lags(plant: Simulator) -> tuple[Linearization, float]:
     for _ in range(max(len(phi), int(LONGEST_ANSWER * time_s / h) + 1)):
         answers.append(float(c @ state))
         state = phi @ state
-    silent = int((np.abs(answers) > ANSWERED * np.abs(answers).max()).argmax())
+    silent = int((np.abs(answers) > CV_ANSWERED * np.abs(answers).max()).argmax())
     dead_s, seen_s = h * silent, time_s - _sum_of_two(variance, skew)
     # Less than half a period more is the sampling, or the error of a difference.
-    if seen_s > dead_s + h / 2 and not (np.cumsum(answers) / gain).max() > 1 + OVERSHOOT:
+    if seen_s > dead_s + h / 2 and not (np.cumsum(answers) / gain).max() > 1 + LAG_OVERSHOOT:
         dead_s = seen_s
     dead_s = min(dead_s, max(time_s - h / 2, 0.0))  # of a dead time alone, the lag is that of a held MV
     left_s = time_s - dead_s

@@ -24,8 +24,8 @@ CLASSIC: dict[int, tuple[float, ...]] = {
     6: (3.25, 6.6, 8.6, 7.45, 3.95),
 }
 """Coefficients of s^(n-1)..s^1 of the tables in use, found on an analogue computer."""
-GRID = 0.01  # of the time wn t over which the ITAE is integrated
-DOUBLINGS = 13  # of the grid: 8192 points, up to wn t = 82
+ITAE_GRID = 0.01  # of the time wn t over which the ITAE is integrated
+GRID_DOUBLINGS = 13  # of the grid: 8192 points, up to wn t = 82
 DECIMALS = 4  # of a coefficient: far finer than the criterion tells apart, coarser than a search's last bits
 
 
@@ -107,19 +107,19 @@ def itae(coefficients: Array) -> float:
     """
     if not _stable(coefficients):
         return math.inf
-    phi, _ = _chain(coefficients).sampled(GRID)
+    phi, _ = _chain(coefficients).sampled(ITAE_GRID)
     # The error's own state starts at (1, 0, .., 0) and decays: x(k) = phi^k x(0), twice as many points a pass.
     x = np.zeros((len(phi), 1))
     x[0] = 1.0
-    for _ in range(DOUBLINGS):
+    for _ in range(GRID_DOUBLINGS):
         x = np.hstack([x, phi @ x])
         phi = phi @ phi
-    times: Array = GRID * np.arange(x.shape[1], dtype=np.float64)
+    times: Array = ITAE_GRID * np.arange(x.shape[1], dtype=np.float64)
     f = times * x[0]
     size = np.abs(f)
     crossed = np.flatnonzero(f[:-1] * f[1:] < 0)
     excess = size[crossed] * size[crossed + 1] / (size[crossed] + size[crossed + 1])
-    return float(GRID * (size.sum() - (size[0] + size[-1]) / 2 - excess.sum()))
+    return float(ITAE_GRID * (size.sum() - (size[0] + size[-1]) / 2 - excess.sum()))
 
 
 @cache

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.plants.simulator import Array, Simulator
 
-STEP = 0.01  # of an MV's range
-SHORTEST, LONGEST = 100, 3200  # samples of a response
-STILL = 0.01  # of its largest change, over its last fifth: a response that has settled
+RESPONSE_STEP = 0.01  # of an MV's range
+SHORTEST_STEP_RUN, LONGEST_STEP_RUN = 100, 3200  # samples of a response
+STILL_RESPONSE = 0.01  # of its largest change, over its last fifth: a response that has settled
 EVEN = 0.05  # relative difference of two slopes that are the same
-RAMP = 0.5  # of a response's largest change, that its last slope makes over all of it: less is a creeping rest
-SETTLED = 0.05  # of the end
-ANSWERS = 0.1  # of the fastest change in a period
+RAMP_SLOPE = 0.5  # of a response's largest change, that its last slope makes over all of it: less is a creeping rest
+END_BAND = 0.05  # of the end
+ANSWERED_CHANGE = 0.1  # of the fastest change in a period
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +54,14 @@ class StepResponses:
         """
         x0, mv0 = plant.start
         low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
-        span, n_cv = np.diag(STEP * (high - low)), len(plant.sp_signals)
+        span, n_cv = np.diag(RESPONSE_STEP * (high - low)), len(plant.sp_signals)
         ends = [np.clip(np.clip(mv0, low, high) + sign * span, low, high) for sign in (1, -1)]
         size = np.diag(ends[0] - ends[1])
         mv = np.concatenate(ends)
         x, advance = np.tile(x0, (len(mv), 1)), plant.many(len(mv))
         rows: list[Array] = []
-        longest = plant.foreseen or LONGEST
-        n = min(SHORTEST, longest)
+        longest = plant.foreseen or LONGEST_STEP_RUN
+        n = min(SHORTEST_STEP_RUN, longest)
         while True:
             while len(rows) < n:
                 x = advance(x, mv)
@@ -73,7 +73,7 @@ class StepResponses:
             slope = _slopes(y)
             if n >= longest or _known(y, slope):
                 spans = (np.array([s.high - s.low for s in plant.sp_signals]), high - low)
-                ramp = (np.abs(slope[-1]) * n >= RAMP * np.abs(y).max(axis=-1)) & ~_settled(y)
+                ramp = (np.abs(slope[-1]) * n >= RAMP_SLOPE * np.abs(y).max(axis=-1)) & ~_settled(y)
                 strongest = np.abs(y[..., -1] * spans[1]).argmax(axis=1)
                 integrates = np.take_along_axis(ramp, strongest[:, None], axis=1)
                 return cls(y, np.where(ramp & integrates, slope[-1], 0.0), plant.period_s, spans)
@@ -104,7 +104,7 @@ class StepResponses:
         n = self.y.shape[-1]
         creeps = np.where(_settled(self.y), 0.0, _slopes(self.y)[-1])
         rests = (self.y + creeps[..., None] * (n - 1 - np.arange(n)))[self.slope == 0]
-        away = [np.flatnonzero(np.abs(y - y[-1]) > SETTLED * np.abs(y).max()) for y in rests if np.abs(y).max() > 0]
+        away = [np.flatnonzero(np.abs(y - y[-1]) > END_BAND * np.abs(y).max()) for y in rests if np.abs(y).max() > 0]
         return max((int(at[-1]) + 2 for at in away if at.size), default=1 if len(rests) else 0)
 
     def crossing(self, width: Array) -> int:
@@ -122,12 +122,12 @@ class StepResponses:
         An answer is a change within a period of more than a tenth of the fastest.
         """
         change = np.abs(np.diff(self.y[cv, mv], prepend=0.0))
-        return int((change > ANSWERS * change.max()).argmax()) + 1
+        return int((change > ANSWERED_CHANGE * change.max()).argmax()) + 1
 
     def starts_inverse(self, cv: int, mv: int) -> bool:
         """Whether the response first goes the other way, by more than a tenth of its end."""
         y = self.y[cv, mv] * np.sign(self.gain[cv, mv])
-        return bool(y.min() < -ANSWERS * abs(y[-1]))
+        return bool(y.min() < -ANSWERED_CHANGE * abs(y[-1]))
 
     def process(self, cv: int, mv: int) -> FirstOrder:
         """The lag with dead time through 28 % and 63 % of the response, or the ramp that an integrating one ends on.
@@ -171,7 +171,7 @@ def _slopes(y: Array) -> Array:
 def _settled(y: Array) -> NDArray[np.bool_]:
     n = y.shape[-1]
     moved = np.abs(y[..., n - 1 - n // 5 :] - y[..., -1:]).max(axis=-1)
-    return np.asarray(moved <= STILL * np.abs(y).max(axis=-1))
+    return np.asarray(moved <= STILL_RESPONSE * np.abs(y).max(axis=-1))
 
 
 def _known(y: Array, slope: Array) -> bool:

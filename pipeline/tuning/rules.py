@@ -15,7 +15,7 @@ from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning.reduction import LagWithDeadTime, minimal
 
 LONGEST_FILTER = 40.0  # periods; an IMC filter is looked for between half a period and this
-ROUNDING = 1e-9  # of a period: no part of a dead time
+RULE_ROUNDING = 1e-9  # of a period: no part of a dead time
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,9 +256,9 @@ def sampled_loop(lin: Linearization, settings: PidSettings, period_s: float, lat
 
 def _periods(late: float) -> tuple[int, float, int]:
     """(whole periods of a dead time, the part of one beyond them, earlier MVs that they need); rounding is no part."""
-    whole = floor(late + ROUNDING)
+    whole = floor(late + RULE_ROUNDING)
     part = max(0.0, late - whole)
-    part = 0.0 if part < ROUNDING else part
+    part = 0.0 if part < RULE_ROUNDING else part
     return whole, part, whole + bool(part)
 
 

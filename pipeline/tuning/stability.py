@@ -18,10 +18,10 @@ from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.tuning.development import LawStep
 
-SETTLING = 50  # steps at rest until a law's state no longer changes
+STATE_REST_STEPS = 50  # steps at rest until a law's state no longer changes
 BISECTIONS = 9  # of the contraction rate: to within 0.2 % of the way to 1
 LARGEST_MARGIN = 100.0  # gain margin beyond which none is sought
-ROUNDING = 1e-9  # a verified contraction this far below 1 counts as one
+CONTRACTION_ROUNDING = 1e-9  # a verified contraction this far below 1 counts as one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +52,7 @@ class FrozenLoops:
         state = torch.zeros(len(cvs), n_state, dtype=torch.float64)
         given = mv
         with torch.no_grad():
-            for _ in range(SETTLING):
+            for _ in range(STATE_REST_STEPS):
                 given, state, _ = law(sp, pv, dv, mv, state)
         if not torch.allclose(given, mv, rtol=0, atol=1e-6 * float(mv.abs().max())):
             raise LawError("a law that moves its MV while on set point has no linear loop there: let it come to rest")
@@ -145,7 +145,7 @@ def quadratic_contraction(loops: Array) -> float:
                 reached = float("nan") if p.value is None else _rate(at, np.asarray(p.value))
             except cvxpy.SolverError:
                 reached = float("nan")
-        if reached < 1 - ROUNDING:
+        if reached < 1 - CONTRACTION_ROUNDING:
             best = reached if np.isnan(best) else min(best, reached)
             high = min(r, reached)
         elif trial is None:

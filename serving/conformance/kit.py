@@ -50,13 +50,13 @@ def read_all(row: Mapping[str, Any], where: str) -> dict[str, Array]:
 # every command arrived, so it shows nothing of what follows one that did not.
 KIT = 3
 VECTORS = "vectors.json"
-TOLERANCE = 1e-6  # share of an entry's scale
+KIT_TOLERANCE = 1e-6  # share of an entry's scale
 PASS = (
     "Start with a state of zeros. A step with cold = true starts from zeros again, every other from the state_next "
     "of the last step that was not refused.",
     "A step with refused = input must be refused because a value is not finite, one with refused = output because "
     "the law's result may not be used. The state stays as it was, as the next step shows.",
-    f"Difference: |yours - ours| / scale, of every entry of mv, state_next and info. At most {TOLERANCE:g} passes.",
+    f"Difference: |yours - ours| / scale, of every entry of mv, state_next and info. At most {KIT_TOLERANCE:g} passes.",
     "The same release of onnxruntime on the same kind of processor must give the same bits: the difference is 0. "
     "Between releases, processors and WebAssembly the last digits differ, which the 300 chained steps may amplify.",
     "A scan is one period of the loop around the controller. Mode and fault must be equal, mv as above. "
@@ -105,7 +105,7 @@ def vectors_of(controller: Controller) -> dict[str, Any]:
             "system": platform.system(),
         },
         "pass": list(PASS),
-        "tolerance": TOLERANCE.hex(),
+        "tolerance": KIT_TOLERANCE.hex(),
         "scale": _scale(controller, steps),
         "steps": [_step_row(m.inputs, answer) for answer in steps],
         "loop": {
@@ -168,7 +168,7 @@ OUTPUTS = ("mv", "state_next", "info")
 READS = (1, 2, KIT)  # versions of the kit
 MOVED = "writes nothing over an MV that was moved after a command that did not arrive"
 UNSHOWN = {1: f"writes nothing before it knows the plant, and that it {MOVED}", 2: MOVED}  # by older kits
-SHOWN = 5  # mistakes named one by one
+SHOWN_MISTAKES = 5  # mistakes named one by one
 
 
 @dataclass(slots=True)
@@ -203,9 +203,9 @@ class KitVerdict:
             f"  largest difference {self.largest:.3g} of an entry's scale, allowed {self.tolerance:g}"
             + (f": {self.where}" if self.where else ""),
         ]
-        lines += [f"  {mistake}" for mistake in self.mistakes[:SHOWN]]
-        if len(self.mistakes) > SHOWN:
-            lines.append(f"  and {len(self.mistakes) - SHOWN} more")
+        lines += [f"  {mistake}" for mistake in self.mistakes[:SHOWN_MISTAKES]]
+        if len(self.mistakes) > SHOWN_MISTAKES:
+            lines.append(f"  and {len(self.mistakes) - SHOWN_MISTAKES} more")
         if self.note:
             lines.append(f"  {self.note}")
         return "\n".join(map(plain, lines))  # the answers' file holds any text

@@ -17,10 +17,10 @@ from loopwright.serving.manifest import Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
 
-RECOVER_AFTER = 3  # good samples in a row after which a loop goes on
+KIT_RECOVERY = 3  # good samples in a row after which a loop goes on
 MAX_GAP = 3  # missed periods in a row that a law bridges: after more it starts cold
-STANDS = 0.3  # share of its range at which an actuator stands before the loop's first command: not its middle
-SURE = 0.4  # share of a margin by which a value lies inside or outside it
+ACTUATOR_STANDS = 0.3  # share of its range at which an actuator stands before the loop's first command: not its middle
+MARGIN_SHARE = 0.4  # share of a margin by which a value lies inside or outside it
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class ScanStart:
     """How the loop of the scans starts: in AUTO, at set points (n_sp,). Nobody tells where the MV stands."""
 
     sp: Array
-    recover_after: int = RECOVER_AFTER
+    recover_after: int = KIT_RECOVERY
     max_gap: int = MAX_GAP
 
 
@@ -78,7 +78,7 @@ def start(manifest: Manifest) -> ScanStart:
 
 def actuators(manifest: Manifest) -> Array:
     """Where the MVs (n_mv,) stand before the loop's first command."""
-    at = [s.low + STANDS * (s.high - s.low) if s.values is None else s.values[-1] for s in manifest.mv]
+    at = [s.low + ACTUATOR_STANDS * (s.high - s.low) if s.values is None else s.values[-1] for s in manifest.mv]
     return np.array(at, dtype=np.float64)
 
 
@@ -120,14 +120,14 @@ def _scans(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
         for _ in range(n):
             good = yield KitScan(what, good)
 
-    recovery = RECOVER_AFTER + 1
+    recovery = KIT_RECOVERY + 1
     good = yield KitScan("the plant cannot be read at first", None)
     good = yield KitScan("a PV at first not finite", _with(good, "pv", 0, nan))
     good = yield KitScan("an applied MV at first not finite", _with(good, "mv_applied", 0, nan))
     good = yield KitScan("no read-back at first", replace(good, mv_applied=None))
     yield from some(1, "the first good sample")
     good = yield KitScan("the plant cannot be read after the first good sample", None)
-    yield from some(RECOVER_AFTER - 1, "before the first command of the law")
+    yield from some(KIT_RECOVERY - 1, "before the first command of the law")
     yield from some(5)
     for what, spoilt in _doubtful(m):
         good = yield KitScan(what, spoilt(good))
@@ -197,7 +197,7 @@ def _doubtful(m: Manifest) -> Iterator[tuple[str, _Spoil]]:
 
 
 def _around(label: str, name: str, i: int, s: Signal, margin: float) -> Iterator[tuple[str, _Spoil]]:
-    for share, words in ((1 - SURE, "within its margin"), (1 + SURE, "beyond its margin")):
+    for share, words in ((1 - MARGIN_SHARE, "within its margin"), (1 + MARGIN_SHARE, "beyond its margin")):
         slack = share * margin * (s.high - s.low)
         yield f"{label} {s.name} below, {words}", _Spoil(name, i, s.low - slack)
         yield f"{label} {s.name} above, {words}", _Spoil(name, i, s.high + slack)

@@ -16,9 +16,9 @@ from loopwright.serving.manifest import SENSITIVE, Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
 
-COURSE = 0.03  # share of a range that an input moves at most from step to step while it follows a course
+COURSE_STEP = 0.03  # share of a range that an input moves at most from step to step while it follows a course
 COLD_STARTS = 10  # cold starts that a host repeats, each with two steps after it
-DRAWS = 40  # tried for a step whose MV lies inside its range
+STEP_DRAWS = 40  # tried for a step whose MV lies inside its range
 AT_AN_END = 0.1  # share of the values drawn anywhere that lie at an end of the range
 
 
@@ -101,7 +101,7 @@ def _drawn(m: Manifest) -> Generator[list[StepInputs], tuple[StepInputs, Array],
     for k in range(60):
         _, last = yield [StepInputs("anywhere", anywhere() | ({"mv_applied": last} if k % 3 else {}), cold=k == 0)]
     for _ in range(60):
-        taken, last = yield [StepInputs("inside", anywhere() | {"mv_applied": last}) for _ in range(DRAWS)]
+        taken, last = yield [StepInputs("inside", anywhere() | {"mv_applied": last}) for _ in range(STEP_DRAWS)]
     course = taken.inputs
     for k in range(80):
         course = moved(course) | {"sp": course["sp"]}
@@ -117,7 +117,7 @@ def _drawn(m: Manifest) -> Generator[list[StepInputs], tuple[StepInputs, Array],
         course = moved(course)
         _, last = yield [StepInputs("stuck actuator", course | {"mv_applied": stuck})]
     for k in range(3 * COLD_STARTS):
-        _, last = yield [StepInputs("cold start", anywhere(), cold=k % 3 == 0) for _ in range(DRAWS)]
+        _, last = yield [StepInputs("cold start", anywhere(), cold=k % 3 == 0) for _ in range(STEP_DRAWS)]
     for name in (n for n in m.inputs if n != "state"):
         for i in range(len(signals[name])):
             for bad in (nan, inf, -inf):
@@ -139,7 +139,9 @@ def _anywhere(rng: np.random.Generator, signals: tuple[Signal, ...]) -> Array:
 def _moved(rng: np.random.Generator, old: Array, signals: tuple[Signal, ...]) -> Array:
     """``old`` (n,) moved a little within each range; a discrete signal stays."""
     moved = [
-        min(max(value + COURSE * rng.uniform(-1, 1) * (s.high - s.low), s.low), s.high) if s.values is None else value
+        min(max(value + COURSE_STEP * rng.uniform(-1, 1) * (s.high - s.low), s.low), s.high)
+        if s.values is None
+        else value
         for value, s in zip(old.tolist(), signals, strict=True)
     ]
     return np.array(moved, dtype=np.float64)

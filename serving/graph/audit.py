@@ -15,7 +15,7 @@ from loopwright.serving.errors import ArtifactError
 from loopwright.serving.graph.onnx_bytes import Message, read_model
 from loopwright.serving.graph.work import BOOL, DOUBLE, ITEM_BYTES, MAX_WORK, RULES, Node, TensorValue, results
 
-MAX_BYTES = 64 * 2**20  # of a controller's file
+MAX_GRAPH_BYTES = 64 * 2**20  # of a controller's file
 # onnxruntime simplifies a graph in a time that grows with the square of its operators: seconds for so many. The largest
 # law is the predictive one: 3,300 with the longest horizon that the work of a step allows, 2,700 with ten passes.
 MAX_NODES = 6_000
@@ -56,8 +56,8 @@ def audit(data: bytes) -> GraphSummary:
     a subgraph, a function, training data, sparse or external tensors; values without a static
     shape; more than 6,000 operators; a step of more than 20 million multiply-adds.
     """
-    if len(data) > MAX_BYTES:
-        raise ArtifactError(f"the file has {len(data)} bytes; a controller has at most {MAX_BYTES}")
+    if len(data) > MAX_GRAPH_BYTES:
+        raise ArtifactError(f"the file has {len(data)} bytes; a controller has at most {MAX_GRAPH_BYTES}")
     try:
         model = read_model(data)
     except ValueError as error:
@@ -147,7 +147,7 @@ def _constant(tensor: Message) -> TensorValue:
     shape, dtype, raw = tuple(tensor.get("dims", [])), tensor.get("data_type", 0), tensor.get("raw_data", b"")
     if dtype not in ITEM_BYTES:
         raise ArtifactError(f"tensor {name!r} has the type {dtype}; allowed are {', '.join(map(str, ITEM_BYTES))}")
-    if any(not 0 <= n <= MAX_BYTES for n in shape) or prod(shape) * ITEM_BYTES[dtype] != len(raw):
+    if any(not 0 <= n <= MAX_GRAPH_BYTES for n in shape) or prod(shape) * ITEM_BYTES[dtype] != len(raw):
         raise ArtifactError(f"tensor {name!r} has the shape {shape} and {len(raw)} bytes, which do not fit together")
     if dtype == BOOL and raw.strip(b"\0\1"):
         raise ArtifactError(f"tensor {name!r} holds truth values other than 0 and 1")

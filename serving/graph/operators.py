@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-MANY = 2**31 - 1  # inputs of a variadic operator: as many as the work of a step allows
+MANY_INPUTS = 2**31 - 1  # inputs of a variadic operator: as many as the work of a step allows
 
 
 class Signature(NamedTuple):
@@ -40,7 +40,7 @@ _EXTREME = Signature(1, 1, (), {"axis": int, "keepdims": int, "select_last_index
 SIGNATURES: dict[str, Signature] = {
     **dict.fromkeys(_UNARY, Signature(1, 1)),
     **dict.fromkeys(_BINARY, Signature(2, 2)),
-    **dict.fromkeys(("Max", "Mean", "Min", "Sum"), Signature(1, MANY)),
+    **dict.fromkeys(("Max", "Mean", "Min", "Sum"), Signature(1, MANY_INPUTS)),
     **dict.fromkeys(_REDUCTIONS, Signature(1, 2, (1,), {"keepdims": int, "noop_with_empty_axes": int})),
     **dict.fromkeys(("ArgMax", "ArgMin"), _EXTREME),
     **dict.fromkeys(("Flatten", "Softmax"), Signature(1, 1, (), {"axis": int})),
@@ -48,7 +48,7 @@ SIGNATURES: dict[str, Signature] = {
     **dict.fromkeys(("Gather", "GatherElements"), Signature(2, 2, (), {"axis": int})),
     "Cast": Signature(1, 1, (), {"saturate": int, "to": int}),
     "Clip": Signature(1, 3, (1, 2)),
-    "Concat": Signature(1, MANY, (), {"axis": int}),
+    "Concat": Signature(1, MANY_INPUTS, (), {"axis": int}),
     "CumSum": Signature(2, 2, (), {"exclusive": int, "reverse": int}),
     "Gemm": Signature(2, 3, (2,), {"alpha": float, "beta": float, "transA": int, "transB": int}),
     "HardSigmoid": Signature(1, 1, (), {"alpha": float, "beta": float}),
@@ -70,7 +70,9 @@ def require_signature(op: str, given: Sequence[bool], attributes: Mapping[str, o
     """
     signature = SIGNATURES[op]
     if not signature.least <= len(given) <= signature.most:
-        takes = f"{signature.least} or more" if signature.most == MANY else f"{signature.least} to {signature.most}"
+        takes = (
+            f"{signature.least} or more" if signature.most == MANY_INPUTS else f"{signature.least} to {signature.most}"
+        )
         raise ValueError(f"it has {len(given)} inputs; it takes {takes}")
     for place, is_named in enumerate(given):
         if not is_named and place not in signature.optional:

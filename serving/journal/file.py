@@ -9,7 +9,7 @@ from pathlib import Path
 
 from loopwright.serving.errors import LoopError
 
-SCHEMA = 2  # of the file: a reader refuses another
+JOURNAL_SCHEMA = 2  # of the file: a reader refuses another
 TABLES = """
 create table if not exists run (id integer primary key, began real not null, controller text not null,
     sha256 text not null, period_s real not null, speed real not null, columns text not null,
@@ -39,15 +39,15 @@ def opened(path: Path, *, write: bool, fsync: str = "crash") -> sqlite3.Connecti
         with closing(base.cursor()) as cursor:
             (version,) = cursor.execute("pragma user_version").fetchone()
             (tables,) = cursor.execute("select count(*) from sqlite_master").fetchone()
-            if version != SCHEMA and (tables or not write):
+            if version != JOURNAL_SCHEMA and (tables or not write):
                 raise LoopError(
-                    f"{path} is no journal of this release (version {version}, not {SCHEMA}); name another file"
+                    f"{path} is no journal of this release (version {version}, not {JOURNAL_SCHEMA}); name another file"
                 )
             if write:
                 cursor.execute("pragma journal_mode=wal")
                 cursor.execute(f"pragma synchronous={'full' if fsync == 'power loss' else 'normal'}")
                 cursor.executescript(TABLES)
-                cursor.execute(f"pragma user_version={SCHEMA}")
+                cursor.execute(f"pragma user_version={JOURNAL_SCHEMA}")
     except sqlite3.Error as error:
         raise LoopError(f"{path} is no journal, or cannot be written: {error}") from None
     return base
@@ -98,7 +98,7 @@ def lock_of(path: Path) -> Path:
     return path.resolve().with_name(path.resolve().name + ".lock")
 
 
-TRIES = 20  # as often a file may be taken away in the moment before it is locked
+LOCK_TRIES = 20  # as often a file may be taken away in the moment before it is locked
 
 
 class LockTakenError(LoopError):
@@ -119,7 +119,7 @@ def locked(path: Path) -> int:
         import fcntl
     except ModuleNotFoundError:
         raise LoopError("files are locked on Linux and macOS; on Windows run the loop in WSL") from None
-    tries = TRIES
+    tries = LOCK_TRIES
     while True:
         tries -= 1
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)

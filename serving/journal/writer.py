@@ -28,7 +28,7 @@ from loopwright.serving.words import named
 
 EVENT_SHARE, EVENT_BYTES = 0.05, 400  # of the size for scans; of an event with its indexes
 LEAST_EVENTS = 1_000  # events that a journal keeps, however small it is
-SLACK = 0.1  # of the events, by which there may be more until some go
+EVENT_SLACK = 0.1  # of the events, by which there may be more until some go
 
 # Of each alarm its newest event, which says whether it is active; and the newest alarms that nobody has acknowledged.
 # With them their ends and acknowledgments.
@@ -69,7 +69,7 @@ def shorten_events(base: sqlite3.Connection, most: int) -> None:
     The state of active alarms stays; of those that are over and not acknowledged, as many as are half of ``most``.
     """
     (count,) = base.execute("select count(*) from event").fetchone()
-    if count <= most * (1 + SLACK):
+    if count <= most * (1 + EVENT_SLACK):
         return
     for statement in KEPT:
         base.execute(statement, {"unseen": most // 2} if ":unseen" in statement else {})
@@ -79,10 +79,10 @@ def shorten_events(base: sqlite3.Connection, most: int) -> None:
 
 # ---------------------------------------------------------------------------------------------------------- the writer
 FLUSH_S = 0.25  # so much is lost at most when the process dies
-BLOCK = 600  # scans that are packed together
+BLOCK_SCANS = 600  # scans that are packed together
 FRESH = 1200  # the last scans, a row each
-WAITING = 200_000  # scans and events that wait in memory while the disk takes none
-TOGETHER = 2_000  # are written at most in one transaction
+WAITING_ENTRIES = 200_000  # scans and events that wait in memory while the disk takes none
+TRANSACTION_ENTRIES = 2_000  # are written at most in one transaction
 STALL_S = 10.0  # a write that takes longer is told
 AGAIN_S = 10.0  # until a file is tried again that could not be made again
 UNSTEADY = 2  # such files in a row that are another one at once, as on some file systems over a network
@@ -95,10 +95,11 @@ class Journal:
     The file is in WAL mode: a process that dies, whatever it was doing, leaves a whole file without its last
     ``FLUSH_S`` at most. With ``fsync`` "power loss" each write waits for the disk. Older scans are packed, and beyond
     ``max_mb`` the oldest go; so do the oldest events, but no alarm that is active (see ``rotation``). While the disk
-    takes nothing, or does not answer, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING`` the oldest are
-    ``lost``, scans before events; what a run is stays. The loop tells it once, and once the journal writes again, an
-    alarm in it says how many they were. A file that is deleted, replaced, cut or damaged meanwhile is made again, with
-    the rows that the open one still gives; an alarm says how many went, and they are ``lost`` (see ``recovery``).
+    takes nothing, or does not answer, scans wait in memory, and ``trouble`` says why. Beyond ``WAITING_ENTRIES`` the
+    oldest are ``lost``, scans before events; what a run is stays. The loop tells it once, and once the journal writes
+    again, an alarm in it says how many they were. A file that is deleted, replaced, cut or damaged meanwhile is made
+    again, with the rows that the open one still gives; an alarm says how many went, and they are ``lost`` (see
+    ``recovery``).
 
     Raises LoopError for a file that is no journal, and for one that another ``Journal`` writes, also of this process.
     """
@@ -182,8 +183,8 @@ class Journal:
         os.close(self._lock)
 
     def _put(self, kind: str, row: Any) -> None:
-        if self._queue.put((kind, row), WAITING):
-            self.tell(f"the journal has {WAITING} scans and events that wait: from now on the oldest are lost")
+        if self._queue.put((kind, row), WAITING_ENTRIES):
+            self.tell(f"the journal has {WAITING_ENTRIES} scans and events that wait: from now on the oldest are lost")
         since = self._writing_s
         if since is not None and not self.trouble and time.monotonic() - since > STALL_S:
             what = "its file is being made again" if self._making else "the disk has not answered"
@@ -223,7 +224,7 @@ class Journal:
                 if self._closing.is_set() and not damaged:
                     self._give_up()
                     return
-                self._queue.give_back(WAITING)
+                self._queue.give_back(WAITING_ENTRIES)
             finally:
                 self._writing_s = None
 
@@ -231,9 +232,9 @@ class Journal:
         """Wait for something to write, then gather for ``FLUSH_S``, unless enough waits already."""
         if not self._closing.is_set():
             self._queue.wait()
-        if self.trouble or len(self._queue) < TOGETHER:
+        if self.trouble or len(self._queue) < TRANSACTION_ENTRIES:
             self._closing.wait(FLUSH_S if self._harm is None else AGAIN_S)
-        self._taken = self._queue.take(TOGETHER)
+        self._taken = self._queue.take(TRANSACTION_ENTRIES)
 
     def _write(self) -> None:
         run, row, ids, n = self._run_id, self._run_row, dict(self._ids), 0
@@ -348,9 +349,9 @@ class Journal:
     def _pack(self) -> None:
         """Pack the oldest scans once there are enough, and drop the oldest blocks once there are too many."""
         (count,) = self._base.execute("select count(*) from scan").fetchone()
-        while count >= FRESH + BLOCK:
+        while count >= FRESH + BLOCK_SCANS:
             rows = self._base.execute(
-                "select id, run, time, mode, numbers, quality, reason from scan order by id limit ?", (BLOCK,)
+                "select id, run, time, mode, numbers, quality, reason from scan order by id limit ?", (BLOCK_SCANS,)
             ).fetchall()
             # One run a block. Releases that let two loops write one journal left runs that alternate, and the ids of a
             # block have no gap: a file that lost rows has one.
@@ -370,7 +371,7 @@ class Journal:
 
     def _rotate(self) -> None:
         """Drop the oldest events once there are too many; seldom looked at, since each look goes through all."""
-        if self._events >= SLACK * self._most_events:
+        if self._events >= EVENT_SLACK * self._most_events:
             self._events = 0
             with self._base:
                 shorten_events(self._base, self._most_events)

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from loopwright.serving.guard import READ_BACK_MARGIN
 from loopwright.serving.manifest import Signal
-from loopwright.serving.mv_readback import SAME, SETTLED
+from loopwright.serving.mv_readback import EQUAL_COMMANDS, SAME_READ_BACK
 
 # -------------------------------------------------------------------------------------------------- faults of any loop
 Array: TypeAlias = NDArray[np.float64]
 
-FAR = 0.1  # of a set point's range: an error beyond it is one that the MV should remove
-AT_END = 1e-6  # of the range
+FAR_ERROR = 0.1  # of a set point's range: an error beyond it is one that the MV should remove
+ACTUATOR_AT_END = 1e-6  # of the range
 MEMORY = 100  # scans over which turns and moves are averaged: of 40 noisy ones four of five turn round now and then
-TURNING, MOVING = 0.8, 0.05  # share of moves that turn round; mean move, of the range
+TURNING_SHARE, TURNING_MOVE = 0.8, 0.05  # share of moves that turn round; mean move, of the range
 
 
 class Plight:
@@ -29,7 +29,8 @@ class Plight:
     mv
         The MVs.
     patience
-        Scans for which an MV may stay at its end beside an error above FAR: a change of the set point takes as many.
+        Scans for which an MV may stay at its end beside an error above FAR_ERROR: a change of the set point takes as
+        many.
     """
 
     def __init__(self, mv: Sequence[Signal], patience: int) -> None:
@@ -51,12 +52,12 @@ class Plight:
 
     def add(self, mv: Array, error: float, time_s: float) -> None:
         """The MVs (n_mv,) of a scan, the largest error as a share of its range, and when that was [s since 1970]."""
-        first, far = self._last is None, error > FAR
+        first, far = self._last is None, error > FAR_ERROR
         self._count += not first
         weight = 1 / min(max(self._count, 1), MEMORY)
         shares = ((mv - self._low) / self._span).tolist()
         for i, share in enumerate(shares):  # a loop over one or two is faster than a dozen calls of numpy
-            end = 1.0 if share >= 1 - AT_END else -1.0 if share <= AT_END else 0.0
+            end = 1.0 if share >= 1 - ACTUATOR_AT_END else -1.0 if share <= ACTUATOR_AT_END else 0.0
             if far and end and end == self.end[i]:
                 self.stuck[i] += 1
             else:
@@ -76,22 +77,23 @@ class Plight:
     def flutters(self, i: int) -> bool:
         """Whether an MV turns round at nearly every scan, by moves that matter."""
         known = self._count >= MEMORY and not self._steps[i]
-        return known and self.turns[i] > TURNING and self.move[i] > MOVING
+        return known and self.turns[i] > TURNING_SHARE and self.move[i] > TURNING_MOVE
 
 
 # --------------------------------------------------------------------- whether each MV's read-back follows its command
 
-STILL = 0.005  # of the range: a read-back that moves by less may be noise, or its resolution
-AWAY = 0.05  # of the range: so far no deadband of a sound actuator reaches
+STILL_READ_BACK = 0.005  # of the range: a read-back that moves by less may be noise, or its resolution
+BEYOND_DEADBAND = 0.05  # of the range: so far no deadband of a sound actuator reaches
 
 
 class Following:
     """Read-backs r(k) beside the commands c(k-1) that they answer, both as shares of the MV's range.
 
-    A read-back stands while it stays within STILL of where it was, at r0 with the command c0. It does not follow where
+    A read-back stands while it stays within STILL_READ_BACK of where it was, at r0 with the command c0. It does not
+    follow where
 
-        |c - c0| > AWAY    at ``patience`` scans in a row, or
-        c - r - offset > SAME, always with one sign, beside an error above FAR    at twice as many.
+        |c - c0| > BEYOND_DEADBAND    at ``patience`` scans in a row, or
+        c - r - offset > SAME_READ_BACK, always with one sign, beside an error above FAR_ERROR    at twice as many.
 
     The second is for laws that add to the applied MV: their command stays near a read-back that is stuck. The offset is
     that of a command which rests and was followed, up to READ_BACK_MARGIN. An MV at the end of its range asks for
@@ -136,22 +138,27 @@ class Following:
         for i, (r, c) in enumerate(zip(read, asked, strict=True)):
             self._rested[i] = self._rested[i] + 1 if c == self._last[i] else 0
             self._last[i] = c
-            if abs(r - self._stood[i]) > STILL:
+            if abs(r - self._stood[i]) > STILL_READ_BACK:
                 self._stood[i], self._from[i], self.since_s[i] = r, c, time_s
                 self._came[i], self.away[i], self.pushed[i] = True, 0, 0
                 continue
-            self.away[i] = self.away[i] + 1 if abs(c - self._from[i]) > AWAY else 0
+            self.away[i] = self.away[i] + 1 if abs(c - self._from[i]) > BEYOND_DEADBAND else 0
             self._push(i, r, c, error)
 
     def _push(self, i: int, r: float, c: float, error: float | None) -> None:
         """Count the scans at which a law asks for more in one direction and gets nothing."""
-        far = error is not None and error > FAR
-        came = self._came[i] and abs(c - self._from[i]) <= SAME  # the read-back has moved since the command did
-        rests = self._rested[i] >= SETTLED and abs(c - r) <= READ_BACK_MARGIN
+        far = error is not None and error > FAR_ERROR
+        # the read-back has moved since the command did
+        came = self._came[i] and abs(c - self._from[i]) <= SAME_READ_BACK
+        rests = self._rested[i] >= EQUAL_COMMANDS and abs(c - r) <= READ_BACK_MARGIN
         if rests and (came or not (far or self.away[i])):
             self._offset[i] = c - r
         wanted = c - r - self._offset[i]
-        side = float(np.sign(wanted)) if far and abs(wanted) > SAME and AT_END < c < 1 - AT_END else 0.0
+        side = (
+            float(np.sign(wanted))
+            if far and abs(wanted) > SAME_READ_BACK and ACTUATOR_AT_END < c < 1 - ACTUATOR_AT_END
+            else 0.0
+        )
         self.pushed[i] = self.pushed[i] + 1 if side and side == self._side[i] else 0
         self._side[i] = side
 

@@ -14,12 +14,13 @@ from loopwright.serving.monitor.plant_drift import Answers
 
 Array: TypeAlias = NDArray[np.float64]
 
-PARTS = 8  # of a batch
+BATCH_PARTS = 8  # of a batch
 LEAST_SCANS = 40  # of a batch
 LEARN, MODEL = 20, 5  # batches
 SAME_LENGTH, SAME_RECIPE = 0.1, 0.02  # of the first one's scans, of a set point's range
-ALIKE = 3  # batches that make a plant one of batches: an operator who takes a loop by hand now and then makes none
-OTHERS = 5  # batches of another recipe in a row: it is the recipe now
+# batches that make a plant one of batches: an operator who takes a loop by hand now and then makes none
+ALIKE_BATCHES = 3
+OTHER_BATCHES = 5  # batches of another recipe in a row: it is the recipe now
 LEAST_SHIFT = 0.002  # of a range: less is not worth a word
 FOREVER = 10**9  # scans: a block ends with its batch alone
 
@@ -56,14 +57,14 @@ class BatchMeans(Remembers):
         self.spans = np.concatenate([self._mv_span, self._pv_span, np.ones(len(self._places))])
         self._n = len(m.sp) + len(self.names)
         self.scans = 0
-        self.sums, self.counts = np.zeros((PARTS, self._n)), np.zeros(PARTS)
+        self.sums, self.counts = np.zeros((BATCH_PARTS, self._n)), np.zeros(BATCH_PARTS)
         self._manifest, self._rate = m, rate
         self._begin(0)
 
     @property
     def known(self) -> bool:
         """Whether the plant makes batches at all."""
-        return self.alike >= ALIKE
+        return self.alike >= ALIKE_BATCHES
 
     def add(self, sample: tuple[Array, Array, Array, Array | None], time_s: float) -> None:
         """One scan: set points, PVs, MVs, info."""
@@ -71,7 +72,7 @@ class BatchMeans(Remembers):
         self.scans += 1
         if not self.length:
             return
-        part = min((self.scans - 1) * PARTS // self.length, PARTS - 1)
+        part = min((self.scans - 1) * BATCH_PARTS // self.length, BATCH_PARTS - 1)
         told = np.zeros(len(self._places)) if info is None else info[self._places]
         shares = (
             (sp - self._sp_low) / self._sp_span,
@@ -94,7 +95,7 @@ class BatchMeans(Remembers):
                 self._compare(means[:, :n_sp], means[:, n_sp:], time_s)
         self.answers.drop()
         self.answers.forget()
-        self.sums, self.counts, self.scans = np.zeros((PARTS, self._n)), np.zeros(PARTS), 0
+        self.sums, self.counts, self.scans = np.zeros((BATCH_PARTS, self._n)), np.zeros(BATCH_PARTS), 0
 
     def forget(self) -> None:
         """A fault: what the model expected is of no use."""
@@ -103,8 +104,8 @@ class BatchMeans(Remembers):
     def _begin(self, scans: int) -> None:
         """Learn batches of ``scans`` scans from here; 0: of the next one's."""
         self.length, self.alike, self.others = scans, 0, 0
-        self.recipe = np.zeros((PARTS, len(self._sp_span)))
-        weekly, n = WEEK_S / (max(scans, 1) * self._period_s), PARTS * len(self.names)
+        self.recipe = np.zeros((BATCH_PARTS, len(self._sp_span)))
+        weekly, n = WEEK_S / (max(scans, 1) * self._period_s), BATCH_PARTS * len(self.names)
         self.chart = Chart(n, LEARN, weekly=weekly, rate=self._rate / 2 / n, least=LEAST_SHIFT)
         self.answers = Answers(
             self._manifest, block=FOREVER, model=MODEL, learn=LEARN, weekly=weekly, rate=self._rate / 2
@@ -117,7 +118,7 @@ class BatchMeans(Remembers):
         same = same and bool((np.abs(recipe - self.recipe) <= SAME_RECIPE).all())
         if not same:
             self.others += 1
-            if self.others >= OTHERS:
+            if self.others >= OTHER_BATCHES:
                 self._begin(0)
             return
         self.alike, self.others = self.alike + 1, 0
@@ -126,9 +127,9 @@ class BatchMeans(Remembers):
 
     def changed(self, i: int) -> tuple[int, float, float] | None:
         """(part of the batch, shift of its mean in the variable's unit, since when) of name ``i``; None: no change."""
-        place = slice(i * PARTS, (i + 1) * PARTS)
+        place = slice(i * BATCH_PARTS, (i + 1) * BATCH_PARTS)
         if not self.chart.found[place].any():
             return None
         part = int(np.argmax(np.abs(self.chart.shares()[place])))
-        at = i * PARTS + part
+        at = i * BATCH_PARTS + part
         return part, self.chart.shift(at) * float(self.spans[i]), float(self.chart.since_s[at])

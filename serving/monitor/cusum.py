@@ -18,7 +18,7 @@ Kept: TypeAlias = Mapping[str, Range]
 
 ANY: Range = (-1e100, 1e100)  # ends of a number that is kept
 POSITIVE: Range = (1e-100, 1e100)  # the same of a number above zero
-SIZE: Range = (0.0, 1e100)  # what cannot be negative
+SIZE_RANGE: Range = (0.0, 1e100)  # what cannot be negative
 COUNT: Range = (0, 10**12)  # the same of a count of figures, scans or blocks
 SIGN: Range = (-1, 1)  # the same of the side of the set point on which an error lies
 TIME_S: Range = (0.0, 1e11)  # since 1970: to the year 5138
@@ -103,8 +103,8 @@ def _shown(kept: Any) -> str:
 
 
 # ----------------------------------------------------------------------- how fast a loop is, and how long it is learnt
-SETTLE, LEAST_SETTLE, MOST_SETTLE = 100, 20, 2000  # scans
-DEAD, MOST_DEAD = 2, 200  # scans
+SETTLE_SCANS, LEAST_SETTLE_SCANS, MOST_SETTLE_SCANS = 100, 20, 2000  # scans
+DEAD_SCANS, MOST_DEAD_SCANS = 2, 200  # scans
 DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0  # [s]
 LEARN_S = 3 * DAY_S  # that rests and blocks are learnt at least: loads of a fast plant need not be fast
 FINE_S = DAY_S  # that the fewest figures of a fast plant last at least
@@ -117,15 +117,15 @@ def settle_scans(m: Manifest) -> int:
     known = {n: row for n, row in rows.items() if isinstance(row, dict)} if isinstance(rows, dict) else {}
     found = [row.get("settling") for name, row in known.items() if not name.endswith(NOISE)]
     times = sorted(float(v) for v in found if isinstance(v, int | float) and v > 0)
-    scans = round(times[len(times) // 2] / m.period_s) if times else SETTLE
-    return min(max(scans, LEAST_SETTLE), MOST_SETTLE)
+    scans = round(times[len(times) // 2] / m.period_s) if times else SETTLE_SCANS
+    return min(max(scans, LEAST_SETTLE_SCANS), MOST_SETTLE_SCANS)
 
 
 def dead_times(m: Manifest) -> list[int]:
-    """Scans after which each controlled variable first answers a move: the evidence's; DEAD where nobody knows."""
+    """Scans after which each controlled variable first answers a move: the evidence's; DEAD_SCANS if nobody knows."""
     told = m.evidence.get("dead_time_periods")
     known = told if isinstance(told, list) and len(told) == len(m.sp) else [None] * len(m.sp)
-    return [d if type(d) is int and 1 <= d <= MOST_DEAD else DEAD for d in known]
+    return [d if type(d) is int and 1 <= d <= MOST_DEAD_SCANS else DEAD_SCANS for d in known]
 
 
 def pooled(least: int, figure_s: float) -> tuple[int, int]:
@@ -142,13 +142,14 @@ def blocks(least: int, shortest_s: float) -> tuple[float, float]:
 
 Array: TypeAlias = NDArray[np.float64]
 
-SLACK = 1.0  # scatters by which a figure may lie off without a trace
-DOUBT = 0.05  # that what was learnt of any one of a chart's figures flatters
-OVERSHOOT = 1.166  # of a sum of normal figures over its limit, in scatters [Siegmund]
+CUSUM_SLACK = 1.0  # scatters by which a figure may lie off without a trace
+LEARNT_DOUBT = 0.05  # that what was learnt of any one of a chart's figures flatters
+SUM_OVERSHOOT = 1.166  # of a sum of normal figures over its limit, in scatters [Siegmund]
 LEAST_LIMIT = 4.0  # in scatters: least limit of a sum, also before it has learnt
 LEAST_ROOT = 0.2  # of chi2 / nu: the approximation holds no further
-FEWEST = 3.0  # degrees of freedom that a scatter is believed to have at least
-WORTH, DOUBLINGS = 12.0, 2  # independent figures that learning needs; how often it may last twice as long for them
+FEWEST_FREEDOMS = 3.0  # degrees of freedom that a scatter is believed to have at least
+# independent figures that learning needs; how often it may last twice as long for them
+LEARNING_WORTH, LEARNING_DOUBLINGS = 12.0, 2
 
 
 class Chart(Remembers):
@@ -162,12 +163,12 @@ class Chart(Remembers):
     at most.
 
     The first ``learn`` figures give mean, scatter s and correlation f = 1 + 2 sum rho: they are worth learn / f
-    independent ones. Below WORTH of those, pairs are averaged, and learning lasts twice as long. Scatter and mean
-    count with the unfavourable ends of their intervals, a higher scatter and a k above SLACK, at a level of DOUBT / n:
-    of many figures one or two were calmer by chance than they will be. Where the scatter
-    s is below ``least``, ``least`` takes its place and f (s / least)^2 that of f, but at least 1: z scatters by less
-    then, and hangs together all the same. The limit is that of a sum of long-run variance f (a Brownian motion) whose
-    mean time to a false alarm is A figures:
+    independent ones. Below LEARNING_WORTH of those, pairs are averaged, and learning lasts twice as long. Scatter and
+    mean count with the unfavourable ends of their intervals, a higher scatter and a k above CUSUM_SLACK, at a level of
+    LEARNT_DOUBT / n: of many figures one or two were calmer by chance than they will be. Where the scatter s is below
+    ``least``, ``least`` takes its place and f (s / least)^2 that of f, but at least 1: z scatters by less then, and
+    hangs together all the same. The limit is that of a sum of long-run variance f (a Brownian motion) whose mean time
+    to a false alarm is A figures:
 
         limit = f / (2 k) ln(1 + 2 k^2 A / f) - 1.17,    A = figures a week / false alarms a week
 
@@ -196,7 +197,7 @@ class Chart(Remembers):
     MOST = 0.5  # of the limit that one figure counts
     KEPT: ClassVar[Kept] = {
         "pool": (1, 10**9),
-        "doublings": (0, DOUBLINGS),
+        "doublings": (0, LEARNING_DOUBLINGS),
         "weekly": POSITIVE,
         "sums": ANY,
         "pooled": COUNT,
@@ -204,14 +205,14 @@ class Chart(Remembers):
         "count": COUNT,
         "mean": ANY,
         "scatter": POSITIVE,
-        "slack": SIZE,
+        "slack": SIZE_RANGE,
         "limit": POSITIVE,
-        "up": SIZE,
-        "down": SIZE,
+        "up": SIZE_RANGE,
+        "down": SIZE_RANGE,
         "last": ANY,
         "recent": ANY,
         "off": ANY,
-        "offs": SIZE,
+        "offs": SIZE_RANGE,
         "found": (0, 1),
         "rises": (0, RISES),
         "began_s": TIME_S,
@@ -277,18 +278,18 @@ class Chart(Remembers):
     def _reckon(self) -> None:
         self.mean, s = self.figures.mean(axis=0), self.figures.std(axis=0, ddof=1)
         f = correlation(self.figures)
-        z = NormalDist().inv_cdf(1 - DOUBT / max(self.n, 1))
+        z = NormalDist().inv_cdf(1 - LEARNT_DOUBT / max(self.n, 1))
         wide = s * np.array([upper_scatter(self.learn / one - 1, z) for one in f.tolist()])
         self.scatter = np.maximum(wide, self.least) + 1e-12
         f = np.maximum(f * (wide / self.scatter) ** 2, 1.0)  # long-run variance of (x - mean) / scatter
-        if self.n and self.learn / f.mean() < WORTH and self.doublings < DOUBLINGS:
+        if self.n and self.learn / f.mean() < LEARNING_WORTH and self.doublings < LEARNING_DOUBLINGS:
             half = self.learn // 2
             self.figures[:half] = self.figures[: 2 * half].reshape(half, 2, self.n).mean(axis=1)
             self.count, self.pool, self.doublings = half, 2 * self.pool, self.doublings + 1
             return
         run_length = self.weekly / self.pool / self.rate * (2 if self.both else 1)
-        self.slack = SLACK + z * np.sqrt(f / self.learn)
-        self.limit = np.array([run_limit(SLACK, run_length, one) for one in f.tolist()])
+        self.slack = CUSUM_SLACK + z * np.sqrt(f / self.learn)
+        self.limit = np.array([run_limit(CUSUM_SLACK, run_length, one) for one in f.tolist()])
         self.recent = self.mean.copy()
         self.figures = np.zeros((self.learn, self.n))
 
@@ -316,7 +317,7 @@ class Chart(Remembers):
 
 def run_limit(slack: float, figures: float, f: float = 1.0) -> float:
     """The limit of a one-sided sum whose mean time to a false alarm is ``figures``; see ``Chart``."""
-    limit = f / (2 * slack) * log(1 + 2 * slack**2 * figures / f) - OVERSHOOT
+    limit = f / (2 * slack) * log(1 + 2 * slack**2 * figures / f) - SUM_OVERSHOOT
     return max(limit, LEAST_LIMIT)
 
 
@@ -326,7 +327,7 @@ def upper_scatter(freedom: float, z: float) -> float:
     sqrt(nu / chi2(nu)), by Wilson's and Hilferty's chi2 = nu (1 - 2 / (9 nu) - z sqrt(2 / (9 nu)))^3, with the normal
     quantile z of the level.
     """
-    nu = max(freedom, FEWEST)
+    nu = max(freedom, FEWEST_FREEDOMS)
     return 1 / sqrt(max(1 - 2 / (9 * nu) - z * sqrt(2 / (9 * nu)), LEAST_ROOT) ** 3)
 
 
@@ -343,4 +344,4 @@ def correlation(x: Array) -> Array:
         means = off[: n // b * b].reshape(n // b, b, -1).mean(axis=1)
         found = np.maximum(found, b * (means**2).mean(axis=0) / variance * (n // b) / (n // b - 1))
     # The mean of n figures is theirs: what lies off it scatters less than the figures, by f / n.
-    return np.minimum(found / np.maximum(1 - found / n, 0.5), n / (FEWEST + 1))
+    return np.minimum(found / np.maximum(1 - found / n, 0.5), n / (FEWEST_FREEDOMS + 1))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.manifest import Manifest, Signal
-from loopwright.serving.monitor.cusum import ANY, COUNT, SIGN, SIZE, Chart, Kept, Remembers
+from loopwright.serving.monitor.cusum import ANY, COUNT, SIGN, SIZE_RANGE, Chart, Kept, Remembers
 
 # ------------------------------------------------------------- mean squares of errors over blocks, by their logarithms
 Array: TypeAlias = NDArray[np.float64]
@@ -34,7 +34,7 @@ def rms_ratio(shift: float) -> float:
 
 PAST_PV, PAST_MV = 2, 5  # samples that it looks back
 SQUARES = 1000  # scans over which squares of errors are averaged
-DOUBT = 100.0  # variance of its numbers before it has learnt
+START_VARIANCE = 100.0  # variance of its numbers before it has learnt
 
 
 class BesideModel(Remembers):
@@ -43,7 +43,7 @@ class BesideModel(Remembers):
     By recursive least squares, until ``freeze``. y are all PVs.
     """
 
-    KEPT: ClassVar[Kept] = {"theta": ANY, "p": ANY, "scans": COUNT, "square": SIZE, "frozen": ANY}
+    KEPT: ClassVar[Kept] = {"theta": ANY, "p": ANY, "scans": COUNT, "square": SIZE_RANGE, "frozen": ANY}
 
     def __init__(self, manifest: Manifest) -> None:
         m = manifest
@@ -51,7 +51,7 @@ class BesideModel(Remembers):
         self._low_u, self._span_u = ranges(m.mv)
         self.n_y, self.n_u = len(m.pv), len(m.mv)
         self.n_phi = PAST_PV * self.n_y + PAST_MV * self.n_u + 1
-        self.theta, self.p = np.zeros((self.n_phi, self.n_y)), DOUBT * np.eye(self.n_phi)
+        self.theta, self.p = np.zeros((self.n_phi, self.n_y)), START_VARIANCE * np.eye(self.n_phi)
         self.scans, self.frozen = 0, False
         self.square = np.zeros(self.n_y)  # mean square of its errors while it learnt
         self._past = np.zeros(self.n_phi)
@@ -120,7 +120,7 @@ class Foresight(Remembers):
     The logarithm of each block's mean square goes into a chart upwards. ``told``: whether the law tells it at all.
     """
 
-    KEPT: ClassVar[Kept] = {"sums": SIZE, "count": COUNT, "chart": ANY}
+    KEPT: ClassVar[Kept] = {"sums": SIZE_RANGE, "count": COUNT, "chart": ANY}
 
     def __init__(self, manifest: Manifest, *, block: int, learn: int, weekly: float, rate: float) -> None:
         m = manifest
@@ -160,22 +160,29 @@ class Foresight(Remembers):
 
 # --------------------------------------------------------------------------------------------------- the control error
 
-CROSSINGS = 20  # intervals between crossings that regularity needs: ten of noise and loads are regular by chance
+# intervals between crossings that regularity needs: ten of noise and loads are regular by chance
+REGULAR_INTERVALS = 20
 ORDER = 15  # of the error's autoregressive model
-LEAST = 1e-12  # variance of the error up to which the index is 1: a larger one is divided by
+LEAST_VARIANCE = 1e-12  # variance of the error up to which the index is 1: a larger one is divided by
 
 
 class Swing(Remembers):
     """Zero crossings of an error, and how regular they are.
 
-    Regularity r = mean / (3 standard deviation) of the last ``CROSSINGS`` intervals between crossings; above 1 the
-    error swings. A crossing counts once the error was beyond a band of ``band`` on the other side.
+    Regularity r = mean / (3 standard deviation) of the last ``REGULAR_INTERVALS`` intervals between crossings; above 1
+    the error swings. A crossing counts once the error was beyond a band of ``band`` on the other side.
 
     Source: Thornhill, Huang, Zhang, "Detection of multiple oscillations in control loops", J. Process Control 13
     (2003) 91.
     """
 
-    KEPT: ClassVar[Kept] = {"side": SIGN, "since": COUNT, "intervals": COUNT, "largest": SIZE, "amplitudes": SIZE}
+    KEPT: ClassVar[Kept] = {
+        "side": SIGN,
+        "since": COUNT,
+        "intervals": COUNT,
+        "largest": SIZE_RANGE,
+        "amplitudes": SIZE_RANGE,
+    }
 
     def __init__(self, band: float) -> None:
         self.band = band
@@ -194,15 +201,15 @@ class Swing(Remembers):
         side = 1 if error > self.band else -1 if error < -self.band else 0
         if side and side != self.side:
             if self.side:
-                self.intervals = [*self.intervals, self.since][-CROSSINGS:]
-                self.amplitudes = [*self.amplitudes, self.largest][-CROSSINGS:]
+                self.intervals = [*self.intervals, self.since][-REGULAR_INTERVALS:]
+                self.amplitudes = [*self.amplitudes, self.largest][-REGULAR_INTERVALS:]
             self.side, self.since, self.largest = side, 0, 0.0
         if self.intervals and self.since > 5 * max(self.intervals):
             self.intervals, self.amplitudes = [], []  # it has stopped
 
     def regularity(self) -> float:
         """r; 0 as long as there are too few crossings."""
-        if len(self.intervals) < CROSSINGS:
+        if len(self.intervals) < REGULAR_INTERVALS:
             return 0.0
         spread = float(np.std(self.intervals))
         return min(float(np.mean(self.intervals)) / (3 * spread), 100.0) if spread else 100.0
@@ -228,7 +235,7 @@ def harris_index(errors: Array, dead: int) -> float:
     e = errors - errors.mean()
     n = len(e)
     r = np.array([e[: n - i] @ e[i:] for i in range(ORDER + 1)]) / n
-    if r[0] <= LEAST:
+    if r[0] <= LEAST_VARIANCE:
         return 1.0
     toeplitz = r[np.abs(np.subtract.outer(np.arange(ORDER), np.arange(ORDER)))] + 1e-9 * r[0] * np.eye(ORDER)
     a = np.linalg.solve(toeplitz, r[1:])
@@ -246,7 +253,7 @@ class Share(Remembers):
     share(k) = share(k-1) + (x(k) - share(k-1)) / min(k, memory)
     """
 
-    KEPT: ClassVar[Kept] = {"value": SIZE, "first": ANY, "count": COUNT}
+    KEPT: ClassVar[Kept] = {"value": SIZE_RANGE, "first": ANY, "count": COUNT}
 
     def __init__(self, learn: int, memory: int) -> None:
         self.learn, self.memory_scans = learn, memory
@@ -283,7 +290,7 @@ def estimated(info: tuple[str, ...]) -> list[int]:
 class Estimates(Remembers):
     """The mean square of each estimate over blocks of ``block`` scans: its logarithm goes into a chart."""
 
-    KEPT: ClassVar[Kept] = {"sums": SIZE, "count": COUNT, "chart": ANY}
+    KEPT: ClassVar[Kept] = {"sums": SIZE_RANGE, "count": COUNT, "chart": ANY}
 
     def __init__(self, info: tuple[str, ...], *, block: int, learn: int, weekly: float, rate: float) -> None:
         self.block = block

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from loopwright.serving.guard import Sample
 from loopwright.serving.loop import Command, Mode
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.monitor.actuator_checks import AT_END, Following, Plight
+from loopwright.serving.monitor.actuator_checks import ACTUATOR_AT_END, Following, Plight
 from loopwright.serving.monitor.batches import BatchMeans
 from loopwright.serving.monitor.cusum import (
     DAY_S,
@@ -59,10 +59,10 @@ def numbers(m: Monitor) -> dict[str, float]:
 Array: TypeAlias = NDArray[np.float64]
 
 LEARN_RESTS, LEARN_MODEL, LEARN_BLOCKS = 300, 20, 40  # periods of rest, blocks of the model, blocks of a chart
-BLOCK = 10  # settling times: a block holds some moves of the set point
+BLOCK_SETTLINGS = 10  # settling times: a block holds some moves of the set point
 FALSE_ALARMS = 0.25  # a week that are allowed to all charts together
 LEAST_DAY, MOST_DAY = 2_000, 200_000  # scans over which a share is taken
-BAND = 0.005  # of a set point's range: smaller errors are no swing
+SWING_BAND = 0.005  # of a set point's range: smaller errors are no swing
 HARRIS_SCANS = 500  # scans that Harris's index is taken from
 NEAR_REST = 0.02  # of a set point's range: a mean error beyond is no rest
 
@@ -71,7 +71,7 @@ class Monitor:
     """Watches one controller in its loop.
 
     ``observe`` takes a scan: bounded work and memory, and no content of it raises. The settling time of the validation
-    (the evidence's ``settling``, else ``SETTLE`` scans) says how long a period of rest is. It learns the normal from
+    (the evidence's ``settling``, else ``SETTLE_SCANS``) says how long a period of rest is. It learns the normal from
     the first periods in AUTO; ``loopwright.serving.monitor.verdicts`` says what each figure is held against.
 
     Parameters
@@ -98,7 +98,7 @@ class Monitor:
         self.spread = Chart(
             len(m.sp), rests // pool, pool=pool, weekly=weekly, rate=rate / len(m.sp), least=0.3, both=False
         )
-        block_s, times = blocks(LEARN_MODEL + LEARN_BLOCKS, BLOCK * self.settle * period)
+        block_s, times = blocks(LEARN_MODEL + LEARN_BLOCKS, BLOCK_SETTLINGS * self.settle * period)
         block, model, learn = ceil(block_s / period), round(times * LEARN_MODEL), round(times * LEARN_BLOCKS)
         weekly = WEEK_S / (block * period)
         self.foresight = Foresight(m, block=block, learn=learn, weekly=weekly, rate=rate)
@@ -107,7 +107,7 @@ class Monitor:
         )
         self.estimates = Estimates(m.info, block=block, learn=learn, weekly=weekly, rate=rate)
         self.batches = BatchMeans(m, rate)
-        self.swings = [Swing(BAND * (s.high - s.low)) for s in m.sp]
+        self.swings = [Swing(SWING_BAND * (s.high - s.low)) for s in m.sp]
         self.plight = Plight(m.mv, 2 * self.settle)
         self.following = Following(m.mv, self.settle)
         self._commanded: Array | None = None  # at the scan before, where it was written
@@ -190,7 +190,7 @@ class Monitor:
         self.following.add(applied, before, error, time_s)
 
     def _shares(self, shares: list[float], command: Command) -> bool:
-        saturated = any(s <= AT_END or s >= 1 - AT_END for s in shares)
+        saturated = any(s <= ACTUATOR_AT_END or s >= 1 - ACTUATOR_AT_END for s in shares)
         self.saturated.add(float(saturated))
         if self._last is not None:
             moves = zip(shares, self._last, self.max_move, strict=True)
@@ -203,7 +203,9 @@ class Monitor:
     def _moved(self, sp: list[float]) -> None:
         """The set points are others than at the scan before."""
         before = self._sp
-        if before is None or any(abs(a - b) > BAND * span for a, b, span in zip(sp, before, self._span, strict=True)):
+        if before is None or any(
+            abs(a - b) > SWING_BAND * span for a, b, span in zip(sp, before, self._span, strict=True)
+        ):
             self._steady()
         self._sp, self._still = sp, 0
         self._clear()

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.manifest import Manifest, Signal
-from loopwright.serving.monitor.cusum import ANY, COUNT, SIZE, Chart, Kept, Remembers
+from loopwright.serving.monitor.cusum import ANY, COUNT, SIZE_RANGE, Chart, Kept, Remembers
 from loopwright.serving.monitor.loop_statistics import LEAST_SIGMA, SQUARES, BesideModel, log_mean_square, rms_ratio
 
 Array: TypeAlias = NDArray[np.float64]
 
-KNOTS = 9  # of the map over each set point's range
-NEAR = 0.3  # leverage below which the map knows a set point
+MAP_KNOTS = 9  # of the map over each set point's range
+NEAR_LEVERAGE = 0.3  # leverage below which the map knows a set point
 LEAST_DRIFT = 0.01  # of the MV's range: less is no drift worth a word
 SMALLEST_MOVE = 0.03  # of the MV's range: a smaller one says nothing of a gain
-MOVES = 6  # that a gain needs
+GAIN_MOVES = 6  # that a gain needs
 FORGET = 0.95  # a move
 WILD = 0.25  # of the learning time in which the map is still too wild for its scatter to be known
 
@@ -26,9 +26,10 @@ WILD = 0.25  # of the learning time in which the map is still too wild for its s
 class RestMap(Remembers):
     """mv_rest = theta' phi(sp), phi piecewise linear over each set point's range, by recursive least squares.
 
-    It learns ``learn`` periods of rest and is frozen then, but where it has no data (leverage phi' P phi >= NEAR) it
-    goes on learning. The distance between the map and the MV goes into a chart, averaged over ``pool`` periods; the
-    moves of the MV from one set point to another beside those of the map tell the plant's gain, whatever the load is.
+    It learns ``learn`` periods of rest and is frozen then, but where it has no data (leverage phi' P phi >=
+    NEAR_LEVERAGE) it goes on learning. The distance between the map and the MV goes into a chart, averaged over
+    ``pool`` periods; the moves of the MV from one set point to another beside those of the map tell the plant's gain,
+    whatever the load is.
     """
 
     KEPT: ClassVar[Kept] = {
@@ -36,9 +37,9 @@ class RestMap(Remembers):
         "p": ANY,
         "judged": COUNT,
         "sxy": ANY,
-        "sxx": SIZE,
-        "syy": SIZE,
-        "moves": SIZE,
+        "sxx": SIZE_RANGE,
+        "syy": SIZE_RANGE,
+        "moves": SIZE_RANGE,
         "last": ANY,
         "last_phi": ANY,
         "chart": ANY,
@@ -50,7 +51,7 @@ class RestMap(Remembers):
         self.sp, self.mv = sp, mv
         figures = round((1 - WILD) * learn / pool)
         self.learn, self._wild = learn, learn - figures * pool
-        n = KNOTS * len(sp)
+        n = MAP_KNOTS * len(sp)
         self._low = np.array([s.low for s in mv])
         self._span = np.array([s.high - s.low for s in mv])
         self.theta, self.p = np.zeros((n, len(mv))), 100.0 * np.eye(n)
@@ -71,22 +72,22 @@ class RestMap(Remembers):
         leverage = float(phi @ self.p @ phi)
         off = share - phi @ self.theta
         learnt = self.learnt
-        if leverage < NEAR:
+        if leverage < NEAR_LEVERAGE:
             self.judged += 1
             if self.judged > self._wild:
                 self.chart.add(off, time_s)
-        if leverage >= NEAR or not learnt:
+        if leverage >= NEAR_LEVERAGE or not learnt:
             gain = self.p @ phi / (1.0 + leverage)
             self.theta = self.theta + np.outer(gain, off)
             self.p = self.p - np.outer(gain, phi @ self.p)
-        if leverage < NEAR:
+        if leverage < NEAR_LEVERAGE:
             self._move(phi, share)
         else:
             self.last_phi = np.zeros_like(phi)
 
     def gain(self, i: int) -> tuple[float, float] | None:
         """(gain over the learnt one, its standard error) for MV ``i``; None as long as too few moves were made."""
-        if self.moves < MOVES or self.sxx[i] <= 0:
+        if self.moves < GAIN_MOVES or self.sxx[i] <= 0:
             return None
         slope = self.sxy[i] / self.sxx[i]
         left = max(self.syy[i] - slope * self.sxy[i], 0.0)
@@ -106,11 +107,11 @@ class RestMap(Remembers):
 
     def _phi(self, sp: Array) -> Array:
         """Piecewise linear functions of each set point, one after the other; they sum to one for each."""
-        phi = np.zeros(KNOTS * len(self.sp))
+        phi = np.zeros(MAP_KNOTS * len(self.sp))
         for i, (s, value) in enumerate(zip(self.sp, sp.tolist(), strict=True)):
-            place = min(max((value - s.low) / (s.high - s.low), 0.0), 1.0) * (KNOTS - 1)
-            k = min(int(place), KNOTS - 2)
-            phi[i * KNOTS + k], phi[i * KNOTS + k + 1] = k + 1 - place, place - k
+            place = min(max((value - s.low) / (s.high - s.low), 0.0), 1.0) * (MAP_KNOTS - 1)
+            k = min(int(place), MAP_KNOTS - 2)
+            phi[i * MAP_KNOTS + k], phi[i * MAP_KNOTS + k + 1] = k + 1 - place, place - k
         return phi
 
 
@@ -135,8 +136,8 @@ class Answers(Remembers):
         "model": ANY,
         "blocks": COUNT,
         "count": COUNT,
-        "told_square": SIZE,
-        "squares": SIZE,
+        "told_square": SIZE_RANGE,
+        "squares": SIZE_RANGE,
         "scores": ANY,
         "sizes": ANY,
         "shapes": ANY,

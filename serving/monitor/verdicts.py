@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 import numpy as np
 
 from loopwright.serving.manifest import Signal
-from loopwright.serving.monitor.batches import PARTS
+from loopwright.serving.monitor.batches import BATCH_PARTS
 from loopwright.serving.monitor.loop_statistics import Foresight, rms_ratio
 
 if TYPE_CHECKING:
@@ -71,12 +71,12 @@ def unit_of(s: Signal) -> str:
 
 # ------------------------------------------------------------------------------------------ the meaning of the figures
 MOST_HOLD = 0.02
-LEAST_SHARE, LEAST_OUTSIDE = 0.2, 0.1  # of the time: at limits, and outside the domain, from which on it is told
-SWINGS = 1.0  # regularity of the error's crossings above which it is a swing, if large enough too
-WORSE = 2.0  # times the validation's worst mean error: how often set points move is another matter here
+TOLD_AT_LIMITS, TOLD_OUTSIDE = 0.2, 0.1  # of the time: at limits, and outside the domain, from which on it is told
+SWING_REGULARITY = 1.0  # regularity of the error's crossings above which it is a swing, if large enough too
+WORSE_ERROR = 2.0  # times the validation's worst mean error: how often set points move is another matter here
 LOUD = 4.0  # times the error at rest: noise crosses zero regularly too, by chance
-PLAIN = 0.1  # of a set point's range: a swing that needs no measure of what is normal
-GAIN, ERRORS = 0.15, 4.0  # change of a gain, and in its standard errors, above which it is told
+PLAIN_SWING = 0.1  # of a set point's range: a swing that needs no measure of what is normal
+TOLD_GAIN_CHANGE, TOLD_GAIN_ERRORS = 0.15, 4.0  # change of a gain, and in its standard errors, above which it is told
 RETRAIN_RATIO, RETRAIN_LEARNT = 1.5, 2.5  # of a law's own prediction; of a linear model beside it
 
 
@@ -195,7 +195,7 @@ def _batches(m: Monitor) -> list[Verdict]:
             part, shift, since = change
             by = f"{abs(shift):.3g} {unit if unit != '-' else ''}".strip()
             text = f"{variable} is {by} {'higher' if shift > 0 else 'lower'} than in the first batches, "
-            text += f"most in part {part + 1} of {PARTS} of a batch, since {when(since)}"
+            text += f"most in part {part + 1} of {BATCH_PARTS} of a batch, since {when(since)}"
             found.append(Verdict(name, "watch", text, shift))
         else:
             found.append(Verdict(name, "as validated", "as in the first batches"))
@@ -214,10 +214,12 @@ def _rest(m: Monitor) -> list[Verdict]:
             continue
         shift = chart.shift(i) * (s.high - s.low)
         gain = m.rest.gain(i)
-        if gain is not None and abs(gain[0] - 1) > max(GAIN, ERRORS * gain[1]):
+        if gain is not None and abs(gain[0] - 1) > max(TOLD_GAIN_CHANGE, TOLD_GAIN_ERRORS * gain[1]):
             change = f"{abs(gain[0] - 1):.0%} {'higher' if gain[0] > 1 else 'lower'}"
             since = f" since {when(chart.since_s[i])}" if chart.found[i] else ""
-            found.append(Verdict(name, "retrain", f"the plant's gain seems {change}{since}", gain[0], 1 + GAIN))
+            found.append(
+                Verdict(name, "retrain", f"the plant's gain seems {change}{since}", gain[0], 1 + TOLD_GAIN_CHANGE)
+            )
         elif chart.found[i]:
             text = f"the plant needs {shift:+.3g} {unit_of(s)}for the same set points since {when(chart.since_s[i])}"
             found.append(Verdict(name, "watch", text, shift, float(chart.scatter[i]) * (s.high - s.low)))
@@ -233,7 +235,7 @@ def _variability(m: Monitor) -> list[Verdict]:
         worst = _worst_validated(m)
         mean = m.errors[i].value * span
         whole = m.errors[i].count >= m.errors[i].memory_scans  # a day: one move of the set point is no measure
-        if worst is not None and len(m.manifest.sp) == 1 and whole and mean > WORSE * worst:
+        if worst is not None and len(m.manifest.sp) == 1 and whole and mean > WORSE_ERROR * worst:
             text = (
                 f"the mean error is {mean:.3g} {unit_of(s)}".strip() + f"; in the validation it was at most {worst:.3g}"
             )
@@ -259,24 +261,24 @@ def _swing(m: Monitor) -> list[Verdict]:
     drift = m.spread
     for i, (s, swing) in enumerate(zip(m.manifest.sp, m.swings, strict=True)):
         r, quiet = swing.regularity(), rms_ratio(float(drift.mean[i])) * (s.high - s.low)
-        loud = LOUD * quiet if drift.learnt else PLAIN * (s.high - s.low)
-        if not drift.learnt and not m.batches.known and not (r > SWINGS and swing.amplitude() > loud):
+        loud = LOUD * quiet if drift.learnt else PLAIN_SWING * (s.high - s.low)
+        if not drift.learnt and not m.batches.known and not (r > SWING_REGULARITY and swing.amplitude() > loud):
             found.append(unknown(f"swing of {s.name}", "the error at rest is still measured"))
-        elif r > SWINGS and swing.amplitude() > loud:
+        elif r > SWING_REGULARITY and swing.amplitude() > loud:
             seconds = swing.period() * m.manifest.period_s
             text = f"{s.name} swings by {swing.amplitude():.3g} {unit_of(s)}every {seconds:.3g} s"
-            found.append(Verdict(f"swing of {s.name}", "watch", text, r, SWINGS))
+            found.append(Verdict(f"swing of {s.name}", "watch", text, r, SWING_REGULARITY))
         else:
-            found.append(Verdict(f"swing of {s.name}", "as validated", "no regular swing", r, SWINGS))
+            found.append(Verdict(f"swing of {s.name}", "as validated", "no regular swing", r, SWING_REGULARITY))
     return found
 
 
 def _shares(m: Monitor) -> list[Verdict]:
-    rows = [("saturated", m.saturated, LEAST_SHARE, "of the time an MV is at an end of its range")]
+    rows = [("saturated", m.saturated, TOLD_AT_LIMITS, "of the time an MV is at an end of its range")]
     if any(s.max_move is not None for s in m.manifest.mv):
-        rows.append(("rate limit", m.limited, LEAST_SHARE, "of the time an MV moves as fast as it may"))
+        rows.append(("rate limit", m.limited, TOLD_AT_LIMITS, "of the time an MV moves as fast as it may"))
     if "in_domain" in m.manifest.info:
-        rows.append(("domain", m.outside, LEAST_OUTSIDE, "of the time the law is outside its applicability domain"))
+        rows.append(("domain", m.outside, TOLD_OUTSIDE, "of the time the law is outside its applicability domain"))
     found = []
     for name, share, least, words in rows:
         if not share.learnt:

@@ -24,7 +24,7 @@ from loopwright.serving.opcua.node_lease import LeaseRefusedError, NodeLease
 from loopwright.serving.opcua.plan import NodePlan
 from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import GOOD, LateError, NodeReading, words
+from loopwright.serving.opcua.values import STATUS_GOOD, LateError, NodeReading, words
 from loopwright.serving.words import first_line, named
 
 __all__ = ["OpcUaEndpoint", "Values"]
@@ -35,10 +35,10 @@ Array: TypeAlias = NDArray[np.float64]
 # was validated with. Twice as long as answers have taken of late, within these bounds.
 LEAST_LEAD, MOST_LEAD, LONGEST_LEAD_S = 0.05, 0.3, 0.5
 FADES = 0.98  # what is remembered of the slowest answer, from scan to scan
-ANSWER, LONGEST_ANSWER_S = 0.8, 5.0  # of a period: so long an answer may take
+ANSWER_PART, LONGEST_OPC_ANSWER_S = 0.8, 5.0  # of a period: so long an answer may take
 SILENT_SCANS = 3  # without any answer: the connection is broken off and made anew
 # Pause [s] before a new connection: first, longest, times the last one.
-FIRST_RETRY_S, LAST_RETRY_S, GROWTH = 0.2, 10.0, 1.6
+FIRST_RETRY_S, LAST_RETRY_S, RETRY_GROWTH = 0.2, 10.0, 1.6
 
 
 _HAND_BACK = "hand back"
@@ -95,7 +95,7 @@ class OpcUaEndpoint:
         self.manifest, self.server, self.nodes = manifest, server, nodes
         self.speed, self.tell, self.clock = speed, tell, clock
         self.max_age_s, self.period_s = max_age_s / speed, manifest.period_s / speed  # of the machine's time
-        self.answer_s = min(ANSWER * self.period_s, LONGEST_ANSWER_S)
+        self.answer_s = min(ANSWER_PART * self.period_s, LONGEST_OPC_ANSWER_S)
         self._slowest_s = MOST_LEAD * self.period_s  # until answers are known
         self.values: Values | None = None
         self.trouble = "not connected yet"  # why there are no values; empty while there are
@@ -243,7 +243,7 @@ class OpcUaEndpoint:
             except Exception as error:
                 self._lost(first_line(error), late=isinstance(error, LateError))
                 await self._rest(pause)
-                pause = min(pause * GROWTH, LAST_RETRY_S)
+                pause = min(pause * RETRY_GROWTH, LAST_RETRY_S)
                 continue
             plan = watching = None
             try:
@@ -283,7 +283,7 @@ class OpcUaEndpoint:
                 else:
                     link.abort()
             await self._rest(pause)
-            pause = min(pause * GROWTH, LAST_RETRY_S)
+            pause = min(pause * RETRY_GROWTH, LAST_RETRY_S)
 
     async def _leased(self, link: Link, plan: NodePlan) -> str:
         """The lease that keeps loops on other machines from writing the same MVs, in words."""
@@ -396,7 +396,7 @@ class OpcUaEndpoint:
             self._failed(first_line(error))
             raise
         names = ["hand_back"] if handing else [s.name for s in self.manifest.mv]
-        wrong = [f"{name}: {words(s)}" for name, s in zip(names, statuses, strict=True) if s >> 30 != GOOD]
+        wrong = [f"{name}: {words(s)}" for name, s in zip(names, statuses, strict=True) if s >> 30 != STATUS_GOOD]
         if wrong:
             self._failed(f"the server refuses {', '.join(wrong)}")
         else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from loopwright.serving.errors import EndpointError
 from loopwright.serving.opcua.link import Link
 from loopwright.serving.opcua.plan import NodePlan
-from loopwright.serving.opcua.values import GOOD, variant, words
+from loopwright.serving.opcua.values import STATUS_GOOD, variant, words
 from loopwright.serving.words import first_line
 
 
@@ -31,7 +31,7 @@ class Heartbeat:
             self.trouble = f"heartbeat: {first_line(error)}"
         else:
             (status,) = await link.write([(node, count)], answer_s)
-            self.trouble = "" if status >> 30 == GOOD else f"the server refuses heartbeat: {words(status)}"
+            self.trouble = "" if status >> 30 == STATUS_GOOD else f"the server refuses heartbeat: {words(status)}"
         if self.trouble:
             (now,) = await link.read([node], answer_s)
             if now.kind is not None:

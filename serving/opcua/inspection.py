@@ -33,7 +33,16 @@ from loopwright.serving.opcua.node_lease import NAME, WRITABLE, SeveralLeasesErr
 from loopwright.serving.opcua.plan import NodePlan, Role, Row, shared_node
 from loopwright.serving.opcua.sampling import NO_NUMBERS
 from loopwright.serving.opcua.settings import NO_LEASE, Nodes, Point, Server
-from loopwright.serving.opcua.values import BAD, FLOATS, GOOD, INTEGERS, UNCERTAIN, NodeReading, exact, words
+from loopwright.serving.opcua.values import (
+    FLOATS,
+    INTEGERS,
+    STATUS_BAD,
+    STATUS_GOOD,
+    STATUS_UNCERTAIN,
+    NodeReading,
+    exact,
+    words,
+)
 from loopwright.serving.words import first_line
 
 NO_LEASE_NOTE = (
@@ -213,7 +222,7 @@ def _lease(node: str, asked: _Asked | str) -> Found:
     reading, writable = asked.reading, asked.writable
     kind = reading.kind.name if reading.kind is not None else "-"
     wrong = ""
-    if reading.quality == BAD:
+    if reading.quality == STATUS_BAD:
         wrong = _bad(reading, node)
     elif reading.kind is not ua.VariantType.String:
         wrong = f"its type {kind} holds no text; it must be a String"
@@ -221,7 +230,7 @@ def _lease(node: str, asked: _Asked | str) -> Found:
         wrong = "it may not be written by this user"
     owner = reading.words_held.partition(" ")[0]
     note = f"{owner} has the plant, or had it last" if owner else ""
-    quality = "Good" if reading.quality == GOOD else words(reading.status)
+    quality = "Good" if reading.quality == STATUS_GOOD else words(reading.status)
     return Found(
         name, node, kind, owner or "-", quality=quality, writable=MAY[writable], wrong=wrong, note=note, written=True
     )
@@ -268,7 +277,7 @@ def _one(server: Server, row: Row, asked: _Asked | str, margin: float) -> Found:
     number = point.scale * reading.number + point.offset
     age = "-" if reading.source_s is None else f"{time.time() - reading.source_s:.3g} s"
     wrong, passing = "", False
-    if reading.quality == BAD or (reading.quality == UNCERTAIN and server.uncertain == "fault"):
+    if reading.quality == STATUS_BAD or (reading.quality == STATUS_UNCERTAIN and server.uncertain == "fault"):
         wrong, passing = _bad(reading, node), words(reading.status) != "BadNodeIdUnknown"
     elif reading.text:
         wrong, passing = f"it holds {reading.text}", reading.text in NO_NUMBERS
@@ -284,7 +293,7 @@ def _one(server: Server, row: Row, asked: _Asked | str, margin: float) -> Found:
         misfit = other_unit(unit, point, signal)
         wrong, passing = (misfit, False) if misfit else (wrong, passing)
         note = "; ".join(filter(None, (outside, _other_range(limits, point, signal))))
-    quality = "Good" if reading.quality == GOOD else words(reading.status)
+    quality = "Good" if reading.quality == STATUS_GOOD else words(reading.status)
     if not row.judged:
         wrong, note = "", "; ".join(filter(None, (wrong, note)))
     shown = "-" if reading.text else f"{number:.6g}"

@@ -32,7 +32,8 @@ from loopwright.serving.opcua.values import (
 
 # How long a server is asked to keep a session of which it hears nothing: some periods, within these bounds.
 SESSION, LEAST_SESSION_S, MOST_SESSION_S = 3, 60.0, 3600.0
-KEPT = 2 / 3  # of the time that the server grants: after so long without a request one is made to keep the session
+# of the time that the server grants: after so long without a request one is made to keep the session
+KEEP_ALIVE = 2 / 3
 KEPT_TRY = 1 / 6  # of it: so long such a request may take before the next one
 
 
@@ -141,7 +142,7 @@ class Link:
         patience_s, time = self.client.session_timeout / 1000, asyncio.get_running_loop().time
         state = ua.NodeId(ua.Int32(ua.ObjectIds.Server_ServerStatus_State))
         while True:
-            left_s = self._asked_s + KEPT * patience_s - time()
+            left_s = self._asked_s + KEEP_ALIVE * patience_s - time()
             if left_s > 0:
                 await asyncio.sleep(left_s)
                 continue

@@ -22,7 +22,8 @@ from loopwright.serving.opcua.plan import NodePlan, Role, Row
 from loopwright.serving.opcua.settings import Nodes, Point
 from loopwright.serving.opcua.values import FLOATS, INTEGERS, unanswered
 
-LOOK_S, WRONG_S = 60.0, 2.0  # between two looks at what may change without a new connection; while something is wrong
+# between two looks at what may change without a new connection; while something is wrong
+NAMEPLATE_LOOK_S, WRONG_S = 60.0, 2.0
 UNKNOWN = "-"
 NULL = ua.VariantType.Null
 NUMBERS = {*FLOATS, *INTEGERS}
@@ -145,7 +146,7 @@ class Nameplates:
     async def watch(self, link: Link, plan: NodePlan, timeout_s: float) -> None:
         """Look again now and then, until a node is another one: ``moved`` then says so."""
         while True:
-            await asyncio.sleep(WRONG_S if self.wrong else LOOK_S)
+            await asyncio.sleep(WRONG_S if self.wrong else NAMEPLATE_LOOK_S)
             try:
                 await self.again(link, plan, timeout_s)
             except ChangedNodeError as error:

@@ -13,7 +13,7 @@ from asyncua import ua
 
 from loopwright.serving.errors import EndpointError, LoopError
 from loopwright.serving.opcua.link import Link
-from loopwright.serving.opcua.values import GOOD, unanswered, words
+from loopwright.serving.opcua.values import STATUS_GOOD, unanswered, words
 
 NAME = "LoopwrightLease"  # of a node beside those of the MVs: it is the lease of every loop that is told of none
 WRITABLE = 2  # the second bit of an access level
@@ -92,7 +92,7 @@ class NodeLease:
 
     async def _write(self, link: Link, node: ua.NodeId, text: str, timeout_s: float) -> None:
         (status,) = await link.write([(node, ua.Variant(text, ua.VariantType.String))], timeout_s)
-        if status >> 30 != GOOD:
+        if status >> 30 != STATUS_GOOD:
             raise LeaseRefusedError(f"the server refuses lease: {words(status)}")
 
 

@@ -16,9 +16,9 @@ from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.nameplates import Nameplates
 from loopwright.serving.opcua.plan import NodePlan, Role, Row
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import BAD, GOOD, UNCERTAIN, NodeReading
+from loopwright.serving.opcua.values import STATUS_BAD, STATUS_GOOD, STATUS_UNCERTAIN, NodeReading
 
-DRIFT = 2e-4  # seconds a second by which two clocks may part
+CLOCK_DRIFT = 2e-4  # seconds a second by which two clocks may part
 JUMP_S = 600.0  # by more than that no value is late: a clock was set
 CONFIRMED = 3  # values of another clock's time before it is believed
 
@@ -61,7 +61,7 @@ def _aged(c: _Course, arrived: float, source: float | None) -> float:
     if source == c.source:
         return c.age + arrived - c.arrived
     lag = arrived - source
-    relaxed = c.offset + DRIFT * (arrived - c.arrived)
+    relaxed = c.offset + CLOCK_DRIFT * (arrived - c.arrived)
     if source < c.source:
         c.before = min(c.recent) if c.before is None else c.before
         c.recent.clear()
@@ -133,7 +133,9 @@ class NodeSampling:
         fault, typed, found, unheard = "", "", dict[str, float](), dict[str, str]()
         for row, answer in zip(plan.rows, answers, strict=False):
             name, point = row.name, row.point
-            usable = answer.quality == GOOD or (answer.quality == UNCERTAIN and self.server.uncertain == "use")
+            usable = answer.quality == STATUS_GOOD or (
+                answer.quality == STATUS_UNCERTAIN and self.server.uncertain == "use"
+            )
             # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
             # is a read-back, which says where the MV stands also while a PV is bad.
             told = usable or row.ages
@@ -148,7 +150,9 @@ class NodeSampling:
                     typed = typed or ("" if row.wish else changed)
             if fault or not row.judged:
                 continue
-            if answer.quality == BAD or (answer.quality == UNCERTAIN and self.server.uncertain == "fault"):
+            if answer.quality == STATUS_BAD or (
+                answer.quality == STATUS_UNCERTAIN and self.server.uncertain == "fault"
+            ):
                 fault = Fault(f"{name}: {answer.words}", f"quality {answer.words}", name)
             elif answer.text:
                 fault = Fault(f"{name}: {_given(row, answer.text)}", "number", name)

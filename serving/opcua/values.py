@@ -29,7 +29,7 @@ INTEGERS = {
 }
 FLOATS = {ua.VariantType.Float, ua.VariantType.Double}
 EPOCH = datetime(1970, 1, 1)
-GOOD, UNCERTAIN, BAD = 0, 1, 2  # the two highest bits of a status
+STATUS_GOOD, STATUS_UNCERTAIN, STATUS_BAD = 0, 1, 2  # the two highest bits of a status
 
 
 class NodeReading(NamedTuple):
@@ -44,8 +44,8 @@ class NodeReading(NamedTuple):
 
     @property
     def quality(self) -> int:
-        """GOOD, UNCERTAIN or BAD."""
-        return min(self.status >> 30, BAD)
+        """STATUS_GOOD, STATUS_UNCERTAIN or STATUS_BAD."""
+        return min(self.status >> 30, STATUS_BAD)
 
     @property
     def words(self) -> str:

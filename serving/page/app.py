@@ -23,7 +23,7 @@ from starlette.staticfiles import StaticFiles
 from loopwright.serving.active_controller import require_fits
 from loopwright.serving.controller_file import file_digest, unseal
 from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
-from loopwright.serving.graph.audit import MAX_BYTES, audit
+from loopwright.serving.graph.audit import MAX_GRAPH_BYTES, audit
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 from loopwright.serving.page.access import LONGEST_BODY, Access
@@ -31,7 +31,7 @@ from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, Shared, s
 from loopwright.serving.page.trend import MOST_POINTS, trend
 from loopwright.serving.words import plain
 
-MOST = 50  # files that are looked at
+MOST_FILES = 50  # files that are looked at
 
 
 def candidates(
@@ -46,7 +46,7 @@ def candidates(
     found: list[dict[str, Any]] = []
     now, _, _ = _described(first or in_charge, trusted)
     beside = (p for p in in_charge.parent.glob("*.onnx") if p.is_file())  # no pipe, which would never end
-    for path in sorted(beside)[:MOST]:
+    for path in sorted(beside)[:MOST_FILES]:
         try:
             manifest, sha256, signed = _described(path, trusted)
             require_fits(manifest, now)
@@ -66,7 +66,7 @@ def _described(path: Path, trusted: Sequence[str] | None) -> tuple[Manifest, str
 
         signed = verified(path, trusted)
     with path.open("rb") as file:
-        data = file.read(MAX_BYTES + 1)
+        data = file.read(MAX_GRAPH_BYTES + 1)
     sha256 = file_digest(data)
     if signed is not None and sha256 != signed.sha256:
         raise ArtifactError(f"{path} was exchanged after its signature was verified")

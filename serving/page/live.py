@@ -19,10 +19,10 @@ from loopwright.serving.words import named
 Ask: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
 
 QUIET = ": still here\n\n"
-POLL_S, STATE_S, QUIET_S = 0.3, 1.0, 15.0  # [s] between two looks, two states, and signs of life
+PAGE_POLL_S, STATE_S, QUIET_S = 0.3, 1.0, 15.0  # [s] between two looks, two states, and signs of life
 MOST_PAGES = 60  # that are sent news at a time
 LATER_MS = 30_000  # after which a page beyond them may come again
-WAITING = 100  # messages that a page that takes none may leave
+WAITING_MESSAGES = 100  # messages that a page that takes none may leave
 MOST_SCANS = 2_000  # that fill a gap; beyond it the page asks for the trend anew
 ENTRIES = 200  # of the journal that a page shows
 
@@ -70,7 +70,7 @@ class Live:
         if self.full:  # others came in at the same moment
             yield f"retry: {LATER_MS}\n\n"
             return
-        queue = asyncio.Queue[str | None](WAITING)
+        queue = asyncio.Queue[str | None](WAITING_MESSAGES)
         self._pages.add(queue)
         try:
             await self._begin()
@@ -104,7 +104,7 @@ class Live:
     async def _run(self) -> None:
         began = 0.0
         while self._pages:
-            await asyncio.sleep(POLL_S)
+            await asyncio.sleep(PAGE_POLL_S)
             texts: list[str] = []
             # A journal that cannot be read now may be read the next time; the state is told meanwhile.
             try:

@@ -13,7 +13,7 @@ from loopwright.serving.journal import JournalReader
 Array: TypeAlias = NDArray[np.float64]
 Piece: TypeAlias = tuple[Array, dict[str, Array], list[str]]  # times, columns, modes
 
-GAP = 5  # periods without a scan: a gap in the line
+LINE_GAP = 5  # periods without a scan: a gap in the line
 MOST_POINTS = 2_000  # of a curve: a screen has no more
 MOST_CHANGES = 4  # of the mode for each point: two rows a point are drawn whole, each with a gap before it
 MODES = ("", "AUTO", "SHADOW", "MANUAL", "HOLD")  # the last is what an operator must not miss
@@ -130,11 +130,11 @@ def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> d
     thinned, whole, count = Thinned(begin_s, end_s, points), list[Piece](), 0
     modes = Modes(begin_s, thinned.bin_s, points)
     runs: dict[int, dict[str, Any]] = {}
-    longest = float(GAP)
+    longest = float(LINE_GAP)
     for run, numbers, mode in reader.tables(begin_s, end_s):
         if not runs:  # of the same state of the file as the scans: another controller may take over meanwhile
             runs = {r["id"]: r for r in reader.runs()}
-            longest = GAP * max(r["period_s"] / r["speed"] for r in runs.values())
+            longest = LINE_GAP * max(r["period_s"] / r["speed"] for r in runs.values())
         order = np.argsort(numbers[:, 0], kind="stable")
         numbers, mode = numbers[order], [mode[i] for i in order]
         times = numbers[:, 0]

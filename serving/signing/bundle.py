@@ -18,7 +18,7 @@ from loopwright.serving.errors import SignatureError
 
 MEDIA_TYPE = "application/vnd.dev.sigstore.bundle.v0.3+json"
 PAYLOAD_TYPE = "application/vnd.in-toto+json"
-MAX_BYTES = 2**20  # of a signature's file
+MAX_SIGNATURE_BYTES = 2**20  # of a signature's file
 MAX_HINT = 200  # characters
 _SHOWN = 60  # letters of a foreign text that a message shows
 

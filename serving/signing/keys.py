@@ -21,8 +21,8 @@ except ModuleNotFoundError:
 
 Kind: TypeAlias = Literal["p256", "ed25519"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-MAX_BYTES = 16 * 2**10  # of a key's file
-SHORT = 16  # digits of a fingerprint in a message
+MAX_KEY_BYTES = 16 * 2**10  # of a key's file
+SHORT_FINGERPRINT = 16  # digits of a fingerprint in a message
 _Public: TypeAlias = ec.EllipticCurvePublicKey | ed25519.Ed25519PublicKey
 _Private: TypeAlias = ec.EllipticCurvePrivateKey | ed25519.Ed25519PrivateKey
 
@@ -53,7 +53,7 @@ class PublicKey:
     @property
     def words(self) -> str:
         """Name, and the start of the fingerprint."""
-        return f"{self.name} (key {self.fingerprint[:SHORT]})"
+        return f"{self.name} (key {self.fingerprint[:SHORT_FINGERPRINT]})"
 
     def signed(self, signature: bytes, data: bytes) -> bool:
         """Whether this key signed the data."""
@@ -176,7 +176,7 @@ def _is_p256(key: object) -> bool:
 
 def _contents(path: Path) -> bytes:
     try:
-        return contents(path, MAX_BYTES)
+        return contents(path, MAX_KEY_BYTES)
     except FileNotFoundError:
         raise SignatureError(f"{path} does not exist; a key is a PEM file, see `loopwright keygen`") from None
 

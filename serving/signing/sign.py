@@ -44,7 +44,7 @@ def sign(
 def _files(path: Path) -> dict[str, str]:
     """Name -> SHA-256 of the controller's file and of its manifest's JSON file, where there is one."""
     try:
-        data = contents(path, audit.MAX_BYTES)
+        data = contents(path, audit.MAX_GRAPH_BYTES)
     except FileNotFoundError:
         raise SignatureError(f"{path} does not exist; give a controller's .onnx file") from None
     try:

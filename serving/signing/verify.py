@@ -117,7 +117,7 @@ def verified(
 
 def _signature(path: Path, signature: Path) -> bytes:
     try:
-        return contents(signature, bundle.MAX_BYTES)
+        return contents(signature, bundle.MAX_SIGNATURE_BYTES)
     except FileNotFoundError:
         raise SignatureError(
             f"it is not signed: there is no {signature.name} beside it; ask its maker for one (`loopwright sign`)"
@@ -160,7 +160,7 @@ def _unchanged(path: Path, statement: Statement) -> str:
         named = ", ".join(sorted(statement.files))[:200]
         raise SignatureError(f"its signature is that of another file ({named}); a signed file keeps its name")
     sidecar = path.with_suffix(".json")
-    for file, most in ((path, audit.MAX_BYTES), (sidecar, MAX_SIDECAR)):
+    for file, most in ((path, audit.MAX_GRAPH_BYTES), (sidecar, MAX_SIDECAR)):
         wanted = statement.files.get(file.name)
         try:
             data = contents(file, most)

@@ -20,8 +20,8 @@ from loopwright.serving.words import first_line, named, plain
 
 Answer: TypeAlias = dict[str, Any]
 
-LONGEST = 100_000  # bytes of a request
-PATIENCE_S = 10.0  # [s] to wait for the loop's answer (a swap's longer), and for a request's line
+LONGEST_REQUEST = 100_000  # bytes of a request
+CONTROL_PATIENCE_S = 10.0  # [s] to wait for the loop's answer (a swap's longer), and for a request's line
 
 
 class Control:
@@ -65,7 +65,7 @@ def door(journal: Path) -> Path:
     return runtime_folder() / (hashlib.sha256(os.fsencode(journal.resolve())).hexdigest()[:24] + ".loop")
 
 
-def ask(journal: Path, request: Answer, patience_s: float = PATIENCE_S) -> Answer:
+def ask(journal: Path, request: Answer, patience_s: float = CONTROL_PATIENCE_S) -> Answer:
     """Ask the loop that writes a journal. LoopError where none runs, or it refuses."""
     answer = asked(door(journal), request, patience_s)
     if "error" in answer:
@@ -73,7 +73,7 @@ def ask(journal: Path, request: Answer, patience_s: float = PATIENCE_S) -> Answe
     return answer
 
 
-def asked(path: Path, request: Answer, patience_s: float = PATIENCE_S) -> Answer:
+def asked(path: Path, request: Answer, patience_s: float = CONTROL_PATIENCE_S) -> Answer:
     """The answer at a socket, a refusal too. LoopError where nobody answers.
 
     A swap is waited for longer: the loop first has the new file tried by another process.
@@ -103,7 +103,7 @@ class _Server(socketserver.ThreadingUnixStreamServer):
 
 
 class _Handler(socketserver.StreamRequestHandler):
-    timeout = PATIENCE_S
+    timeout = CONTROL_PATIENCE_S
 
     def handle(self) -> None:
         """One request, one answer."""
@@ -113,9 +113,9 @@ class _Handler(socketserver.StreamRequestHandler):
     def _said(self) -> Answer:
         assert isinstance(self.server, _Server)
         try:
-            line = self.rfile.readline(LONGEST)
+            line = self.rfile.readline(LONGEST_REQUEST)
             if not line.endswith(b"\n"):
-                raise LoopError(f"a request is one line of JSON of at most {LONGEST} bytes")
+                raise LoopError(f"a request is one line of JSON of at most {LONGEST_REQUEST} bytes")
             return self.server.answer(json.loads(line))
         except NotProvenError as error:  # whoever asked may give the word
             return {"error": first_line(error), "needs": "accept_unproven", "unproven": plain(error.why)}

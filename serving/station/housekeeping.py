@@ -10,7 +10,7 @@ from contextlib import suppress
 from loopwright.serving.words import named
 
 # ------------------------------------------------------------------- lines for a reader that may be slow, full or gone
-WAITING = 1_000  # lines
+WAITING_LINES = 1_000  # lines
 LONGEST_END_S = 2.0  # that an end waits for lines to be read
 
 
@@ -18,12 +18,12 @@ class Said:
     """Says lines by ``tell`` in a thread of its own, in their order; ``tell`` may block or raise as it likes.
 
     ``print`` blocks where a terminal is halted or a pipe is full, and raises where the disk behind it is. At most
-    ``WAITING`` lines wait; those beyond are dropped, and a line tells how many.
+    ``WAITING_LINES`` lines wait; those beyond are dropped, and a line tells how many.
     """
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         self._tell = tell
-        self._lines = queue.Queue[str | None](WAITING)
+        self._lines = queue.Queue[str | None](WAITING_LINES)
         self._dropped, self._ended = 0, False
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None
@@ -66,7 +66,7 @@ class Said:
 
 
 # -------------------------------------------------------------------------------- files in a folder for temporary ones
-EVERY_S = 60.0  # an alarm of another loop ends so long after that loop at most
+TENDING_EVERY_S = 60.0  # an alarm of another loop ends so long after that loop at most
 
 
 class Tending:
@@ -76,7 +76,7 @@ class Tending:
     """
 
     def __init__(
-        self, act: Callable[[], None], trouble: Callable[[str], None] = lambda _: None, every_s: float = EVERY_S
+        self, act: Callable[[], None], trouble: Callable[[str], None] = lambda _: None, every_s: float = TENDING_EVERY_S
     ) -> None:
         self._act, self._trouble, self._every_s, self._said = act, trouble, every_s, ""
         self._closing = threading.Event()

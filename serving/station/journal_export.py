@@ -75,8 +75,8 @@ def _seconds(since: str) -> float:
 # -------------------------------------------------------------------------------------------------------- a row a scan
 WRITTEN = ("pv", "dv", "applied", "sp")  # groups of columns; the MV as the actuator has it from then on
 MEASURED = ("pv", "applied", "dv")  # in the order of a scan's statuses
-GOOD, UNCERTAIN = 0, 1  # the two highest bits of a status
-LATE = 1.5  # periods to the next scan from which it does not say what the actuator had
+EXPORT_GOOD, EXPORT_UNCERTAIN = 0, 1  # the two highest bits of a status
+LATE_PERIODS = 1.5  # periods to the next scan from which it does not say what the actuator had
 
 
 def export(journal: Path, out: Path) -> int:
@@ -113,7 +113,7 @@ def export(journal: Path, out: Path) -> int:
                 last = now
                 row = _Row(run, last, _believed(scan, runs[run]), scan.mode)
                 if waiting is not None:
-                    table.writerow(waiting.cells(names, row if now - waiting.time_s < LATE * period else None))
+                    table.writerow(waiting.cells(names, row if now - waiting.time_s < LATE_PERIODS * period else None))
                 waiting = row
                 count += 1
             if waiting is not None:
@@ -132,7 +132,7 @@ def _believed(scan: ScanEntry, columns: Sequence[str]) -> dict[str, float]:
 
     A loop that does not use values of uncertain quality has a fault at each; one that it uses comes without.
     """
-    worst = GOOD if scan.reason else UNCERTAIN
+    worst = EXPORT_GOOD if scan.reason else EXPORT_UNCERTAIN
     bad = [status >> 30 > worst for status in scan.quality]  # empty: all is good
     pvs, mvs, dvs = ([c for c in columns if c.startswith(f"{group} ")] for group in MEASURED)
     wrong = {name for name, is_bad in zip([*pvs, *mvs, *dvs], bad, strict=False) if is_bad}

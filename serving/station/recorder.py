@@ -133,7 +133,7 @@ def _listed(values: Array | None, n: int) -> Iterable[float]:
 
 
 ALARMING, ALARM = {"watch", "retrain"}, "monitor "
-LOOK_S, KEEP_S = 10.0, 600.0  # between two looks at the verdicts, and two writings of what was learnt
+VERDICT_LOOK_S, KEEP_S = 10.0, 600.0  # between two looks at the verdicts, and two writings of what was learnt
 
 
 class Watching:
@@ -164,7 +164,7 @@ class Watching:
         self.monitor.observe(time_s, sample, command)
         self._scans += 1
         period_s = controller.manifest.period_s
-        if self._scans % ceil(LOOK_S / period_s) == 0:
+        if self._scans % ceil(VERDICT_LOOK_S / period_s) == 0:
             self._look()
         if self._scans % ceil(KEEP_S / period_s) == 0:
             self.keep()

@@ -21,7 +21,7 @@ from loopwright.serving.words import first_line, plain
 
 MAX_AGE = 1.5  # periods: one answer may be late, two may not
 TRANSFER = 20.0  # periods
-MAX_DEPTH = 20  # of lists and tables in each other
+MAX_SETTINGS_DEPTH = 20  # of lists and tables in each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class Settings:
             raise LoopError(f"{path} is not TOML: {first_line(error)}") from None
         except RecursionError:
             raise LoopError(f"{path} is not TOML that can be read: lists or tables are nested too deep") from None
-        if why := refused(tree, MAX_DEPTH):
+        if why := refused(tree, MAX_SETTINGS_DEPTH):
             raise LoopError(f"{path} has {why}")
         found = parse(cls, tree, str(path), LoopError)
         at = path.parent

@@ -54,8 +54,9 @@ if TYPE_CHECKING:
 
 Array: TypeAlias = NDArray[np.float64]
 
-POLL_S, SILENCE_S = 0.05, 1.0  # between two looks for the first values, and until it is said that there are none
-LONGEST_ANSWER_S = 5.0  # [s] that a request waits for the end of a scan
+# between two looks for the first values, and until it is said that there are none
+FIRST_VALUES_POLL_S, SILENCE_S = 0.05, 1.0
+LONGEST_SCAN_WAIT_S = 5.0  # [s] that a request waits for the end of a scan
 
 
 class Station:
@@ -213,10 +214,10 @@ class Station:
         while not usable(self.endpoint.values) and not self.ended:
             if self.settings.start == "SHADOW" and waited >= limit:
                 return None
-            time.sleep(POLL_S)
-            if waited < SILENCE_S <= waited + POLL_S:
+            time.sleep(FIRST_VALUES_POLL_S)
+            if waited < SILENCE_S <= waited + FIRST_VALUES_POLL_S:
                 self.tell("the plant gives no values yet: the loop goes on trying; Ctrl-C ends it")
-            waited += POLL_S
+            waited += FIRST_VALUES_POLL_S
         return self.endpoint.values if usable(self.endpoint.values) else None
 
     def _before(self, k: int) -> None:
@@ -344,7 +345,7 @@ class Station:
         self.ask(replace(wanted, done=said.put))
         period = self.manifest.period_s / self.settings.speed
         try:
-            refused = said.get(timeout=min(2 * period, LONGEST_ANSWER_S))
+            refused = said.get(timeout=min(2 * period, LONGEST_SCAN_WAIT_S))
         except queue.Empty:
             return {"done": f"{wanted.what}: with the next scan, within {period:g} s"}
         if refused:

@@ -12,7 +12,7 @@ from own_cases import case_of, loop_of, section
 
 from loopwright.pipeline.cases.own_model import OwnPlant
 from loopwright.pipeline.cases.own_plant import DAILY, OwnCase
-from loopwright.pipeline.cases.own_tests import LEAST, MOST, day, spread, windows
+from loopwright.pipeline.cases.own_tests import LEAST_DAILY_ROWS, MOST_DAILY_ROWS, day, spread, windows
 from loopwright.pipeline.evaluation.trials import Trials
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.metrics import mae
@@ -95,7 +95,7 @@ def test_the_recorded_noise_is_not_added_to_and_weighs_nothing_in_the_gate() -> 
 
 def test_there_is_no_such_test_without_set_points_or_where_they_are_known_for_short_times_only() -> None:
     pv, mv, sp = record()
-    case = own(np.where(np.arange(ROWS)[:, None] % LEAST, sp, np.nan), pv, mv)
+    case = own(np.where(np.arange(ROWS)[:, None] % LEAST_DAILY_ROWS, sp, np.nan), pv, mv)
     assert DAILY not in case.scenarios()
     assert len(case.lacking) == 1  # the report says so
     case = own(sp, pv, mv)
@@ -109,7 +109,7 @@ def test_windows_lie_within_a_run_and_within_what_is_known() -> None:
     long[4000:4100] = np.nan
     case = own(long, np.tile(pv, (6, 1)), np.tile(mv, (6, 1)))
     found = windows(case.record, long, 30)
-    assert all(LEAST <= rows.stop - rows.start <= MOST for rows in found)
+    assert all(LEAST_DAILY_ROWS <= rows.stop - rows.start <= MOST_DAILY_ROWS for rows in found)
     assert all(np.isfinite(long[rows]).all() for rows in found)
     assert [rows.stop for rows in found] == [2001, 3999, 6101, 8101, 8999]
     assert spread(found) == [found[0], found[2], found[4]]  # of 6,000 rows

@@ -12,7 +12,7 @@ from own_cases import controllers_of_a_lag
 
 from loopwright.pipeline.cases.operating_range import SCALES, Reach, held_at
 from loopwright.pipeline.cases.own_plant import GATE
-from loopwright.pipeline.cases.own_tests import ABOVE_NOISE, LEAST_LOAD, LOAD, held_load, load_size, whole_load
+from loopwright.pipeline.cases.own_tests import ABOVE_NOISE, LEAST_LOAD, TEST_LOAD, held_load, load_size, whole_load
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.rests import courses
@@ -100,13 +100,13 @@ def test_a_small_room_gives_the_load_that_fits_it(monkeypatch: pytest.MonkeyPatc
     assert held_load(reach, reach.model, 0, upwards=True) is None
 
 
-@pytest.mark.parametrize(("noise", "standard"), [(0.01, LOAD), (0.5, None)])
+@pytest.mark.parametrize(("noise", "standard"), [(0.01, TEST_LOAD), (0.5, None)])
 def test_a_load_is_seen_above_the_noise_and_its_test_says_its_size(noise: float, standard: float | None) -> None:
     """The record's standard deviation is .6: a quarter is .15, and three times a noise of .5 is 1.5."""
     case = controllers_of_a_lag({}, moved=(-0.5, 0.5), noise=noise)
     spread = float(case.record.pv[:, 0].std())
     size = load_size(case.reach, 0)
-    assert size == pytest.approx(LOAD * spread if standard else ABOVE_NOISE * noise)
+    assert size == pytest.approx(TEST_LOAD * spread if standard else ABOVE_NOISE * noise)
     test = case.scenarios()["load"][0]
     assert test.title.startswith(f"A load that moves y0 by {size:.3g} m if no controller acts; or as much as")
     assert test.plant is not None

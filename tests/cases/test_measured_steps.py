@@ -14,7 +14,7 @@ from identified_models import first_order
 from own_cases import case_of, section
 
 from loopwright.pipeline.cases.own_plant import GATE, LOAD_AT, MEASURED, OwnCase
-from loopwright.pipeline.cases.own_tests import ROOM
+from loopwright.pipeline.cases.own_tests import LOAD_ROOM
 from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.evaluation.trials import close_loop
 from loopwright.pipeline.laws.predictive.predictive import Predictive
@@ -108,7 +108,7 @@ def test_a_step_that_no_mv_could_balance_is_made_smaller(tmp_path: Path, monkeyp
         assert test.dv is not None
         step = test.dv[LOAD_AT, 0]
         assert abs(step) > 0
-        assert abs(test.mv0[0] - 6 * step) <= 1 - 2 * ROOM + 1e-9
+        assert abs(test.mv0[0] - 6 * step) <= 1 - 2 * LOAD_ROOM + 1e-9
         assert abs(step) < 0.4
 
 

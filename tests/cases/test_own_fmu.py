@@ -16,8 +16,8 @@ from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.cases.own_simulator import SimulatedCase
 from loopwright.pipeline.commands.own_plant.from_simulator import (
     MISSING,
-    SLOW,
-    WANTED,
+    SLOW_SETTLING,
+    WANTED_SETTLING,
     proposals,
     simulated,
     table_from,
@@ -111,14 +111,14 @@ def test_nothing_is_asked_where_the_fmu_says_all(here: Path) -> None:
 def test_a_short_step_for_a_fast_solver_becomes_a_period_that_suits_the_plant(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("loopwright.pipeline.excitation.planned.LONGEST", 640)
+    monkeypatch.setattr("loopwright.pipeline.excitation.planned.LONGEST_RUN", 640)
     path = fmu(here, CLEAR.replace('stepSize="30"', 'stepSize="1.5"'))  # it settles in 1060 of them
     table = table_from(path, (), "", None)
     assert table is not None
     assert table.step_s == 1.5
     made = simulated(FileSimulator(path, "basin", table=table), 500, None)
     assert made.test.settles
-    assert WANTED / 1.2 < made.test.settling_periods <= SLOW
+    assert WANTED_SETTLING / 1.2 < made.test.settling_periods <= SLOW_SETTLING
     assert made.test.settling_periods * made.plant.period_s == pytest.approx(1590, rel=0.05)
 
 

@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from loopwright.pipeline.cases import CASES, all_cases
-from loopwright.pipeline.cases.own_model import LEAST_GAIN, Doubts, OwnPlant
+from loopwright.pipeline.cases.own_model import LEAST_GAIN_ERROR, Doubts, OwnPlant
 from loopwright.pipeline.cases.own_plant import LOAD_AT, OwnCase, own_case
-from loopwright.pipeline.cases.own_tests import LOAD
+from loopwright.pipeline.cases.own_tests import TEST_LOAD
 from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.dynamics import Dynamics
@@ -120,14 +120,14 @@ def test_a_set_point_is_held_three_times_as_long_as_the_model_needs(heater: OwnC
 
 def test_spoilt_plants_have_errors_and_carry_a_load(heater: OwnCase) -> None:
     tests = heater.scenarios()
-    high = 1 + LEAST_GAIN
+    high = 1 + LEAST_GAIN_ERROR
     assert {float(t.changes["gain_TIC-101.OP"][0]) for t in tests["spoilt"]} == {high, 1 / high}
     for test in tests["load"]:
         assert test.plant is not None
         rest = simulate_closed(test.plant, lambda sp, pv, mv: (mv, []), test)
         assert np.ptp(rest.pv[: LOAD_AT + 1]) < 1e-6
         moved = rest.pv[heater.hold + LOAD_AT, 0] - rest.pv[0, 0]
-        assert abs(moved) == pytest.approx(LOAD * heater.record.pv[:, 0].std(), rel=0.01)
+        assert abs(moved) == pytest.approx(TEST_LOAD * heater.record.pv[:, 0].std(), rel=0.01)
     assert len({np.sign(test.changes["load_TIC-101.PV"][-1]) for test in tests["load"]}) == 2
 
 

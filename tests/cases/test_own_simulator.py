@@ -14,7 +14,7 @@ from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.cases.own_model import OwnPlant
 from loopwright.pipeline.cases.own_simulator import SimulatedCase
-from loopwright.pipeline.cases.own_tests import LOAD
+from loopwright.pipeline.cases.own_tests import TEST_LOAD
 from loopwright.pipeline.plants.simulator_file import FileSimulator
 from loopwright.pipeline.simulation.simulate import simulate_closed
 from loopwright.pipeline.stages.check import mistakes
@@ -118,7 +118,7 @@ def test_a_load_moves_the_simulator_as_far_as_it_would_the_models(heater: Simula
         assert name == "load_valve"
         rest = simulate_closed(test.plant, lambda sp, pv, mv: (mv, []), test)
         moved = rest.pv[heater.hold, 0] - rest.pv[0, 0]
-        assert abs(moved) == pytest.approx(LOAD * heater.record.pv[:, 0].std(), rel=0.1)  # the heater is nonlinear
+        assert abs(moved) == pytest.approx(TEST_LOAD * heater.record.pv[:, 0].std(), rel=0.1)  # the heater is nonlinear
 
 
 def test_a_load_is_no_larger_than_the_valve_can_take_back(heater: SimulatedCase) -> None:

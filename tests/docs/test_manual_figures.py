@@ -9,7 +9,7 @@ import pytest
 from pages import DOCS, PAGES, ROOT
 
 from loopwright.serving.monitor.cusum import blocks, pooled
-from loopwright.serving.monitor.monitor import BLOCK, LEARN_BLOCKS, LEARN_MODEL, LEARN_RESTS
+from loopwright.serving.monitor.monitor import BLOCK_SETTLINGS, LEARN_BLOCKS, LEARN_MODEL, LEARN_RESTS
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
@@ -23,7 +23,7 @@ def test_the_monitor_learns_as_long_as_the_pages_say(name: str) -> None:
     rests, autos = [], []
     for settle_s in (26.0, 1800.0):
         rests.append(pooled(LEARN_RESTS, settle_s)[0] * settle_s)
-        block_s, times = blocks(LEARN_MODEL + LEARN_BLOCKS, BLOCK * settle_s)
+        block_s, times = blocks(LEARN_MODEL + LEARN_BLOCKS, BLOCK_SETTLINGS * settle_s)
         autos.append(block_s * times * (LEARN_MODEL + LEARN_BLOCKS))
     text = (DOCS / name).read_text(encoding="utf-8").replace("\n", " ")
     paragraph = text[text.index("300 periods of rest" if name == "on_the_plant.md" else "300 settling times") :][:700]

@@ -9,7 +9,7 @@ import pytest
 
 from loopwright.pipeline.engine import progress
 from loopwright.pipeline.engine.parallel import parallel_map
-from loopwright.pipeline.engine.progress import EVERY_S, Lines, WorkPiece, steps, within
+from loopwright.pipeline.engine.progress import LINE_EVERY_S, Lines, WorkPiece, steps, within
 
 
 class Clock:
@@ -25,7 +25,7 @@ def clock() -> Iterator[Clock]:
     """The time of the lines of this thread; enough has passed for a first one."""
     found = Clock()
     token = progress._lines.set(Lines(found))
-    found.now += EVERY_S
+    found.now += LINE_EVERY_S
     yield found
     progress._lines.reset(token)
 
@@ -53,7 +53,7 @@ def test_the_steps_of_a_single_item_are_shown_under_its_label(clock: Clock, caps
     def item(_: int) -> None:
         show = steps("tuning", 4)
         for done in (1, 2):
-            clock.now += EVERY_S
+            clock.now += LINE_EVERY_S
             show(done)
 
     steps("of nobody", 1)(1)
@@ -69,7 +69,7 @@ def test_the_steps_of_a_single_item_are_shown_under_its_label(clock: Clock, caps
 
 def test_several_items_are_counted_by_their_weights(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     def item(value: float) -> float:
-        clock.now += EVERY_S
+        clock.now += LINE_EVERY_S
         return math.sqrt(value)
 
     assert parallel_map(item, [4.0, 9.0], "roots", [1.0, 3.0]) == [2.0, 3.0]

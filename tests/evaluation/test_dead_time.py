@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.cases import CASES
-from loopwright.pipeline.evaluation.open_loop import LONGEST, dead_times
+from loopwright.pipeline.evaluation.open_loop import LONGEST_DEAD_TIME, dead_times
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.serving.manifest import Signal
 
@@ -26,13 +26,13 @@ class Delayed(Simulator):
 
     @property
     def start(self) -> tuple[Array, Array]:
-        return np.zeros(2 + 2 * LONGEST), np.zeros(2)
+        return np.zeros(2 + 2 * LONGEST_DEAD_TIME), np.zeros(2)
 
     def step(self, x: Array, mv: Array, dv: Array, p: Array) -> Array:
         past = np.concatenate([mv, x[2:]]).reshape(-1, 2)  # newest first
         first, second, cross = self.delays
         a = 0.9 * x[0] + past[first - 1, 0] + 0.5 * past[cross - 1, 1]
-        return np.concatenate([[a, 0.8 * x[1] + past[second - 1, 1]], past[:LONGEST].ravel()])
+        return np.concatenate([[a, 0.8 * x[1] + past[second - 1, 1]], past[:LONGEST_DEAD_TIME].ravel()])
 
     def measure(self, x: Array) -> Array:
         return x[:2]
@@ -49,7 +49,7 @@ def test_the_quickest_mv_counts_for_each_controlled_variable(
 
 
 def test_a_variable_that_never_answers_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("loopwright.pipeline.evaluation.open_loop.LONGEST", 5)
+    monkeypatch.setattr("loopwright.pipeline.evaluation.open_loop.LONGEST_DEAD_TIME", 5)
     assert dead_times(Delayed(3, 9, 9)) == [3, None]
 
 

@@ -17,7 +17,7 @@ from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.commands.stress import outcomes_of
 from loopwright.pipeline.engine.cluster import connected, local_cluster
 from loopwright.pipeline.errors import PlantError
-from loopwright.pipeline.evaluation.stress.draws import KINDS, LATE, NOISE, Actuators, Draw, Drawing
+from loopwright.pipeline.evaluation.stress.draws import KINDS, LATE_LOOPS, NOISE, Actuators, Draw, Drawing
 from loopwright.pipeline.evaluation.stress.loops import Stress, advance_rows, swings
 from loopwright.pipeline.evaluation.stress.summary import Summary, table
 from loopwright.pipeline.export.gate import export
@@ -81,7 +81,7 @@ def test_the_share_of_faults_is_the_one_asked_for() -> None:
     assert all(d.fault is None for d in Drawing(PH_CASE, faults=0.0).draws(range(20)))
     draws = Drawing(PH_CASE, faults=1.0).draws(range(60))
     assert {d.fault.kind for d in draws if d.fault} == set(KINDS)
-    assert abs(np.mean([d.late for d in draws]) - LATE) < 0.25
+    assert abs(np.mean([d.late for d in draws]) - LATE_LOOPS) < 0.25
     held = [replace(d, fault=None) for d in draws[:3]]
     assert all(same(a, b) for a, b in zip(held, Drawing(PH_CASE, faults=0.0).draws(range(3)), strict=True))
 

@@ -12,7 +12,7 @@ import pytest
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.evaluation import trials
 from loopwright.pipeline.evaluation.case import Case, Curve, Figure
-from loopwright.pipeline.evaluation.trials import DRAW, close_loop, repeated, seized, swings_on, try_files
+from loopwright.pipeline.evaluation.trials import DRAW_SEEDS, close_loop, repeated, seized, swings_on, try_files
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.serving.errors import OutputError
@@ -54,7 +54,9 @@ def test_noisy_figures_are_means_over_different_noise(case: Case) -> None:
     test = case.scenarios()["trajectory"][0]
     controller: Any = Proportional()
     found = repeated(controller, case, test, True, 7)
-    loops = [close_loop(controller, case.plant, test, case.noise_std, 7 + DRAW * i) for i in range(case.noise_draws)]
+    loops = [
+        close_loop(controller, case.plant, test, case.noise_std, 7 + DRAW_SEEDS * i) for i in range(case.noise_draws)
+    ]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
     assert len({row["sse"] for row in rows}) == case.noise_draws
     assert found.metrics["sse"] == pytest.approx(np.mean([row["sse"] for row in rows]), rel=1e-12)

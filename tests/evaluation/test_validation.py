@@ -15,7 +15,7 @@ from loopwright.pipeline.evaluation.law_evidence import FormAnalysis, lock_up_te
 from loopwright.pipeline.evaluation.leaderboard import CaseStanding
 from loopwright.pipeline.evaluation.validation import (
     FILE,
-    SCHEMA,
+    VALIDATION_SCHEMA,
     CheckedStatement,
     GateRecord,
     GateResult,
@@ -82,7 +82,7 @@ def test_what_is_written_is_what_is_read(validation: Validation, write: Callable
     assert again == validation
     assert again.to_json() == text
     tree = json.loads(text)
-    assert tree["schema"] == SCHEMA
+    assert tree["schema"] == VALIDATION_SCHEMA
     assert tree["laws"]["pid"] == {"seeds": 1, "lock_ups": 0, "step_us": 20.0}  # nothing is said where there is nothing
     assert tree["laws"]["inc"]["locked_up"] == LOCKED
 

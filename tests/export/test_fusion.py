@@ -192,7 +192,7 @@ def scaled_product(rng: np.random.Generator) -> onnx.ModelProto:
 def test_no_factor_is_fused_into_a_float32_attribute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     model = scaled_product(np.random.default_rng(0))
     assert narrow(model, tmp_path) == ["FusedMatMul", "FusedMatMul"]  # what the guard is for
-    monkeypatch.setattr(fusion, "LEAST_SHARE", -1.0)
+    monkeypatch.setattr(fusion, "LEAST_SAVING", -1.0)
     made = fused(model)
     assert narrow(made, tmp_path) == []
     assert_factors_exact(model, made)
@@ -221,7 +221,7 @@ def test_a_factor_of_one_element_beside_a_product_stays_double(tmp_path: Path, m
         {"out": (1,)},
         x=(5,),
     )
-    monkeypatch.setattr(fusion, "LEAST_SHARE", -10.0)
+    monkeypatch.setattr(fusion, "LEAST_SAVING", -10.0)
     made = fused(model)
     assert narrow(made, tmp_path) == []
     x = np.array([0.3, 1.2, 2.0, 0.7, 0.5])

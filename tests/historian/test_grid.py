@@ -125,7 +125,7 @@ def test_a_long_grid_in_chunks_is_the_same_as_in_one(monkeypatch: pytest.MonkeyP
     for one in both:
         one.code[bad] = Reason.TEXT
     whole, _ = resampled(both[:1], both[1:], 1.0, hold_s=3.0)
-    monkeypatch.setattr(grid_module, "CHUNK", 17)
+    monkeypatch.setattr(grid_module, "GRID_CHUNK", 17)
     chunks, _ = resampled(both[:1], both[1:], 1.0, hold_s=3.0)
     assert chunks.bridged == whole.bridged
     for tag in ("y", "u"):

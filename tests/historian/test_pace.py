@@ -19,7 +19,7 @@ from loopwright.pipeline.historian.cleaning.record_rows import WINDOWED
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.historian.settling import (
-    FINE,
+    FINE_EXPORT,
     MOST_PERIODS,
     Pace,
     SettlingAnswer,
@@ -156,7 +156,7 @@ def test_rows_that_show_a_long_settling_keep_their_step_and_the_remark_names_a_b
         "takes about 27 min to settle after mv0, 160 rows of 10 s: predictive control looks at most 60 ahead; "
         "--period 30 lets it look as far as the plant settles"
     )
-    assert found.period(1600 / FINE - 0.1) > 1600 / MOST_PERIODS - 1
+    assert found.period(1600 / FINE_EXPORT - 0.1) > 1600 / MOST_PERIODS - 1
 
 
 @pytest.mark.parametrize("step_s", [0.04, 0.7, 1.0, 6.0, 7.5])

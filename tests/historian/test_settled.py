@@ -17,10 +17,10 @@ from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.screening import spelt
 from loopwright.pipeline.historian.settling import certain, step_answers
 from loopwright.pipeline.historian.step_test import (
+    AMPLITUDE_UNDER_LOADS,
     GUESSED_H,
-    LARGEST,
+    LARGEST_AMPLITUDE,
     LONGEST_H,
-    MOST,
     UNKNOWN_PERIODS,
     load_sd,
     planned,
@@ -127,8 +127,8 @@ def test_a_step_test_takes_hours(settling: dict[str, object], tmp_path: Path) ->
 def test_a_step_is_sized_over_the_load_within_range_and_rate(tmp_path: Path) -> None:
     report = report_of(tmp_path, load_move=9.0, settling_s=600.0)
     assert planned([report], [50.0], 10.0).sizes == (9.0,)
-    assert planned([replace(report, load_move=80.0)], [50.0], 10.0).sizes == (100 * MOST,)
-    assert planned([replace(report, load_move=80.0, certain=())], [50.0], 10.0).sizes == (100 * LARGEST,)
+    assert planned([replace(report, load_move=80.0)], [50.0], 10.0).sizes == (100 * AMPLITUDE_UNDER_LOADS,)
+    assert planned([replace(report, load_move=80.0, certain=())], [50.0], 10.0).sizes == (100 * LARGEST_AMPLITUDE,)
     assert planned([replace(report, load_move=80.0)], [50.0], 10.0, {report.name: 1.0}).sizes == (10.0,)
     assert all(0 <= v <= 100 for (v,) in planned([replace(report, load_move=80.0)], [97.0], 10.0).values)
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from loopwright.pipeline.laws.gain_update import LONGEST, PidForm, gain_update
+from loopwright.pipeline.laws.gain_update import LONGEST_ACTION, PidForm, gain_update
 
 LO, HI = np.array([0.0, 0.0, 0.0]), np.array([5.0, 2.0, 8.0])
 W = np.array([1.0, 0.3, 2.0])
@@ -165,5 +165,5 @@ def test_gains_are_the_pid_of_equation_4(kc: float, tau_i: float, tau_d: float, 
 
 def test_times_stay_finite_without_an_action() -> None:
     z = torch.tensor([[0.0, 1.0, 2.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1e-20, 1e-21, 1e-25]], dtype=torch.float64)
-    times = 2 * LONGEST * np.array([[0, 1], [1, 0], [0, 0], [0, 0]])
+    times = 2 * LONGEST_ACTION * np.array([[0, 1], [1, 0], [0, 0], [0, 0]])
     np.testing.assert_allclose(PidForm(2.0, 1.0, HI)(z)[:, 1:].numpy(), times, atol=1e-9)

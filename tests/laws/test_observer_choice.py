@@ -13,7 +13,12 @@ from shipped import required
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws import LAWS, ControlLaw
-from loopwright.pipeline.laws.inverse.from_identified import CALM, CLEAR, HorizonChoice, linearized
+from loopwright.pipeline.laws.inverse.from_identified import (
+    CALM_EIGENVALUE,
+    CLEAR_OVER_NOISE,
+    HorizonChoice,
+    linearized,
+)
 from loopwright.pipeline.laws.inverse.inverse_dob import ObserverLaw
 from loopwright.pipeline.laws.suitability import require_fit
 from loopwright.pipeline.models.identified.identified import Identified
@@ -68,8 +73,8 @@ def loop(law: ControlLaw, model: Identified, sp: np.ndarray, load: np.ndarray) -
 def test_the_horizon_reaches_beyond_the_dead_time_and_its_loop_is_calm(dead: int) -> None:
     found = chosen(cascade(dead))
     assert found.horizon >= dead + 2  # the level answers the jacket one period later, and then the dead time passes
-    assert found.radius <= CALM
-    assert found.clearness >= CLEAR
+    assert found.radius <= CALM_EIGENVALUE
+    assert found.clearness >= CLEAR_OVER_NOISE
     assert chosen(cascade(dead + 1)).horizon > found.horizon
 
 
@@ -79,7 +84,7 @@ def test_of_a_lag_the_horizon_is_the_first_with_a_clear_answer(pole: float, nois
     model = first_order(pole)
     model.noise[:] = noise
     answer = 2.0 * (1 - pole ** np.arange(1, 201))
-    assert chosen(model, made_signals()).horizon == 1 + int((answer >= CLEAR * noise).argmax())
+    assert chosen(model, made_signals()).horizon == 1 + int((answer >= CLEAR_OVER_NOISE * noise).argmax())
 
 
 def test_the_observed_pv_is_the_one_that_answers_best_beside_its_noise() -> None:
@@ -106,7 +111,7 @@ def test_an_inverse_response_is_looked_past() -> None:
         answers.append(x[0])
     found = chosen(model, made_signals())
     assert answers[found.horizon - 1] * answers[-1] > 0
-    assert found.radius <= CALM
+    assert found.radius <= CALM_EIGENVALUE
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -24,11 +24,11 @@ from loopwright.pipeline.laws.predictive.observer import (
     BOOST,
     CALMING,
     FIRST_LOAD,
-    FORGETTING,
     FULL,
+    INNOVATION_FORGETTING,
     OUTLIER,
     RISE,
-    SWINGS,
+    SWING_WEIGHT,
     Noises,
     Observer,
     StateEstimate,
@@ -36,7 +36,15 @@ from loopwright.pipeline.laws.predictive.observer import (
 )
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
-from loopwright.pipeline.laws.predictive.tuning import FORGETS, TRAVEL, TriedNumbers, calmest, judged, searched, tuned
+from loopwright.pipeline.laws.predictive.tuning import (
+    FORGETS,
+    TRAVEL_COST,
+    TriedNumbers,
+    calmest,
+    judged,
+    searched,
+    tuned,
+)
 from loopwright.pipeline.laws.predictive.tuning_loops import LOOPS, LoopErrors, TuningLoops, _late, side_by_side
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.static.mlp import MLP
@@ -184,11 +192,13 @@ def test_the_filter_is_the_textbook_s_on_a_linear_model(seed: int, where: Where)
         mean, p = f @ mean + b @ v + c, f @ p @ f.T + q
         error = y - h @ mean
         scaled = np.clip(error / np.sqrt(np.diag(h @ p @ h.T + r)), -OUTLIER, OUTLIER)
-        drift = drift + FORGETTING * (scaled - drift)
+        drift = drift + INNOVATION_FORGETTING * (scaled - drift)
         bounded = scaled * np.abs(scaled)
         square, signed = square + CALMING * (np.abs(bounded) - square), signed + CALMING * (bounded - signed)
-        calm = np.maximum(1 + SWINGS * (square - np.abs(signed) - 1), 1)
-        boost = np.clip(drift**2 * (2 - FORGETTING) / (RISE * FORGETTING) / calm - 1, 0, FULL) / FULL
+        calm = np.maximum(1 + SWING_WEIGHT * (square - np.abs(signed) - 1), 1)
+        boost = (
+            np.clip(drift**2 * (2 - INNOVATION_FORGETTING) / (RISE * INNOVATION_FORGETTING) / calm - 1, 0, FULL) / FULL
+        )
         for i in range(2):
             for x in begun[..., i]:
                 g = np.r_[x, np.eye(2)[i]]
@@ -404,7 +414,7 @@ def test_the_search_takes_what_costs_least() -> None:
 def test_of_numbers_that_err_nearly_the_same_the_calmest_are_taken() -> None:
     """Their travel counts once, by its size, and not in the limit."""
     rows = ((1.0, 3.0), (1.04, 1.0), (1.049, 2.0), (1.06, 0.1))
-    made = [TriedNumbers({}, error + TRAVEL * travel, travel=travel) for error, travel in rows]
+    made = [TriedNumbers({}, error + TRAVEL_COST * travel, travel=travel) for error, travel in rows]
     assert [c.error for c in made] == pytest.approx([error for error, _ in rows])
     assert calmest(made) is made[1]
 
@@ -558,7 +568,7 @@ def test_the_cost_weighs_relative_errors_and_travel() -> None:
         LoopErrors(even, uneven, np.array([[0.0, 0.0], [2.0, 4.0]])), given, [{"speed": 1.0}, {"speed": 2.0}]
     )
     assert found[0].cost == 1.0
-    assert found[1].cost == pytest.approx(0.5 + 0.5 * 3.0 / 2.0 + 3 * TRAVEL)
+    assert found[1].cost == pytest.approx(0.5 + 0.5 * 3.0 / 2.0 + 3 * TRAVEL_COST)
     assert found[1].row() == {"speed": 2.0, "set_points": 1.0, "loads": 1.5, "travel": 3.0, "cost": found[1].cost}
 
 

@@ -20,7 +20,7 @@ from loopwright.pipeline.models import MODELS, load_model
 from loopwright.pipeline.models.base import simulate
 from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
 from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import (
-    LEAST,
+    LEAST_VALVE_EFFECT,
     HybridFuzzyPart,
     Rules,
     Transitions,
@@ -222,8 +222,8 @@ def test_valves_keep_their_sign_where_they_do_nothing(reactor_record: Record) ->
     for how in HOWS:
         b = identify(data, CENTRES, how).consequents[:, 2].numpy()
         assert b[0].min() > 1.0
-        assert b[1].max() <= -LEAST
-    assert identify(Transitions.of(reactor_record), CENTRES, "tied").consequents[1, 2].max() <= -LEAST
+        assert b[1].max() <= -LEAST_VALVE_EFFECT
+    assert identify(Transitions.of(reactor_record), CENTRES, "tied").consequents[1, 2].max() <= -LEAST_VALVE_EFFECT
 
 
 def test_what_the_data_leave_open_is_named() -> None:

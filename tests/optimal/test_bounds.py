@@ -271,7 +271,7 @@ def test_noisy_figures_are_means_over_the_draws(tmp_path: Path, monkeypatch: pyt
         list(bounds_stage.compute(TinyCase((1,)), ["held_out"], path=path))
         return whole_bounds(TinyCase((1,)), path)["held_out_noise"]["nmpc"]
 
-    both, one, other = figures(2, 0), figures(1, 0), figures(1, bounds_stage.DRAW)
+    both, one, other = figures(2, 0), figures(1, 0), figures(1, bounds_stage.DRAW_SEEDS)
     assert both["mae"] == pytest.approx((one["mae"] + other["mae"]) / 2, rel=1e-5)
     assert one["mae"] != other["mae"]
 

@@ -17,7 +17,7 @@ from fmu_parts import EXAMPLE, FMI_2, FMI_3, KEEPS_2, KEEPS_3, TABLE, WRITES_2, 
 
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.plants.fmu.description import FmuRow, FmuTable
-from loopwright.pipeline.plants.fmu.instance import INSTANCES, KEPT, Instance
+from loopwright.pipeline.plants.fmu.instance import INSTANCES, KEPT_STATES, Instance
 from loopwright.pipeline.plants.fmu.program import PREFIX
 from loopwright.pipeline.plants.simulator_file import FileSimulator
 from loopwright.pipeline.simulation.simulate import simulate_open
@@ -89,7 +89,7 @@ def test_many_tests_go_on_side_by_side_from_any_state(aeration: FileSimulator) -
     dv, p, rng = aeration.dv_nominal, aeration.parameters(), np.random.default_rng(1)
     asked = [[] for _ in range(3 * INSTANCES)]
     states = [aeration.start[0] for _ in asked]
-    for _ in range(4 * KEPT):  # in any order, so that every test leaves the instance to others
+    for _ in range(4 * KEPT_STATES):  # in any order, so that every test leaves the instance to others
         k = int(rng.integers(len(asked)))
         mv = rng.uniform(0, 100, 1)
         asked[k].append(mv)

@@ -18,7 +18,7 @@ from rich.console import Console
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.evaluation.leaderboard import CaseStanding, tally
-from loopwright.pipeline.evaluation.validation import SCHEMA
+from loopwright.pipeline.evaluation.validation import VALIDATION_SCHEMA
 from loopwright.pipeline.report import templating
 from loopwright.pipeline.report.overview import write_overview
 from loopwright.pipeline.report.results import show_results
@@ -40,7 +40,7 @@ def a_case(name: str, metric: str, bound: float | None, errors: dict[str, float]
         law: {metric: e, f"{metric}_min": 0.9 * e, f"{metric}_max": 1.1 * e, "seeds": 3} for law, e in errors.items()
     }
     return {
-        "schema": SCHEMA,
+        "schema": VALIDATION_SCHEMA,
         "case": name,
         "metric": metric,
         "best": "alpha",

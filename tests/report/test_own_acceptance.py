@@ -9,7 +9,7 @@ import pytest
 from own_cases import controllers_of_a_lag
 
 from loopwright.pipeline.cases.own_plant import OwnCase
-from loopwright.pipeline.evaluation.closed_loop import FAR
+from loopwright.pipeline.evaluation.closed_loop import UNREACHED_ERROR
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
 from loopwright.pipeline.evaluation.validation import CheckedStatement
@@ -80,7 +80,7 @@ def test_the_best_law_must_settle_in_every_test() -> None:
     """The range is 6 m wide: 2 % of it is .12."""
     good = row(evidence(law("predictive", 1.0, spoilt=1.1), None), "largest error at the end")
     bad = row(evidence(law("predictive", 1.0, spoilt=1.3), None), "largest error at the end")
-    assert (good.limit, good.measured, good.holds) == (f"≤ {FAR * 6:g} m", "0.11 m in test spoilt", True)
+    assert (good.limit, good.measured, good.holds) == (f"≤ {UNREACHED_ERROR * 6:g} m", "0.11 m in test spoilt", True)
     assert (bad.measured, bad.holds) == ("0.13 m in test spoilt", False)
 
 

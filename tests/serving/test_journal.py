@@ -25,7 +25,7 @@ from loopwright.serving import Controller, LoopError
 from loopwright.serving.journal import EventEntry, Journal, JournalReader, ScanEntry, columns, writer
 from loopwright.serving.journal.entries import EVENT, Kind, packed, unpacked
 from loopwright.serving.journal.file import TABLES
-from loopwright.serving.journal.writer import BLOCK, FRESH, LEAST_EVENTS, SLACK, shorten_events
+from loopwright.serving.journal.writer import BLOCK_SCANS, EVENT_SLACK, FRESH, LEAST_EVENTS, shorten_events
 from loopwright.serving.page import app
 from loopwright.serving.station.recorder import Recorder
 
@@ -51,7 +51,7 @@ def same(a: ScanEntry, b: ScanEntry) -> bool:
 
 
 def test_what_is_written_is_read_also_after_it_was_packed(tmp_path: Path, controller: Controller) -> None:
-    given = scans(FRESH + 3 * BLOCK + 7)
+    given = scans(FRESH + 3 * BLOCK_SCANS + 7)
     journal = Journal(tmp_path / "loop.journal")
     journal.begin(controller.manifest, controller.sha256, 1e9)
     for scan in given:
@@ -97,7 +97,7 @@ def test_a_journal_goes_on_where_it_was(tmp_path: Path, controller: Controller) 
 
 
 def test_the_oldest_go_where_it_would_grow_too_large(tmp_path: Path, controller: Controller) -> None:
-    path, sizes, n = tmp_path / "loop.journal", [], FRESH + 10 * BLOCK
+    path, sizes, n = tmp_path / "loop.journal", [], FRESH + 10 * BLOCK_SCANS
     for _ in range(4):
         journal = Journal(path, max_mb=0.2)
         journal.begin(controller.manifest, controller.sha256, 1e9)
@@ -109,7 +109,7 @@ def test_the_oldest_go_where_it_would_grow_too_large(tmp_path: Path, controller:
     ids = [i for i, _, _ in reader.scans()]
     reader.close()
     assert ids == list(range(ids[0], 4 * n + 1))  # no gap within
-    assert ids[0] > 3 * n - BLOCK
+    assert ids[0] > 3 * n - BLOCK_SCANS
     assert sizes[3] < 1.05 * sizes[1] < 1_500_000
 
 
@@ -141,7 +141,7 @@ def test_events_are_bounded_and_no_alarm_is_lost_that_somebody_has_yet_to_see(
     ])  # fmt: skip
     reader = JournalReader(path)
     found = reader.events()
-    assert LEAST_EVENTS <= len(found) <= (1 + SLACK) * LEAST_EVENTS
+    assert LEAST_EVENTS <= len(found) <= (1 + EVENT_SLACK) * LEAST_EVENTS
     assert [i for i, _ in found[:7]] == [1, 2, 3, 4, 6, 8, found[6][0]]  # 6 is the newest of its alarm
     assert [e.what for _, e in found[6:]] == [f"set point {k}" for k in range(5 * LEAST_EVENTS)][6 - len(found) :]
     assert [e.event.what for e in reader.active()] == ["standing", "standing and seen"]
@@ -157,7 +157,7 @@ def test_events_are_bounded_and_no_alarm_is_lost_that_somebody_has_yet_to_see(
         written([event(9, "fault", "flaps" * raised, alarm="flap", raised=raised) for _ in range(5 * LEAST_EVENTS)
                  for raised in (True, False)])  # fmt: skip
     reader = JournalReader(path)
-    assert len(reader.events()) <= (1 + SLACK) * LEAST_EVENTS
+    assert len(reader.events()) <= (1 + EVENT_SLACK) * LEAST_EVENTS
     assert reader.events()[-1][0] == last + 30 * LEAST_EVENTS
     assert [e.event.what for e in reader.active()] == ["standing", "standing and seen"]
     reader.close()
@@ -169,7 +169,7 @@ def test_runs_go_with_their_last_scan(tmp_path: Path, controller: Controller) ->
     for _ in range(6):
         journal = Journal(path, max_mb=0.2)
         journal.begin(controller.manifest, controller.sha256, 1e9)
-        for scan in scans(4 * BLOCK):
+        for scan in scans(4 * BLOCK_SCANS):
             journal.scan(scan)
         journal.close()
     reader = JournalReader(path)
@@ -192,7 +192,7 @@ def test_a_second_writer_is_refused_and_the_first_goes_on(tmp_path: Path, contro
     assert other.returncode == 1
     assert f"{path} is written by another loop (process {os.getpid()})" in other.stderr
     first.begin(controller.manifest, controller.sha256, 1e9)
-    given = scans(FRESH + 2 * BLOCK)
+    given = scans(FRESH + 2 * BLOCK_SCANS)
     for scan in given:
         first.scan(scan)
     first.close()
@@ -204,7 +204,7 @@ def test_a_second_writer_is_refused_and_the_first_goes_on(tmp_path: Path, contro
 
 def test_runs_that_alternate_lose_nothing_when_they_are_packed(tmp_path: Path, controller: Controller) -> None:
     """Two loops that wrote one journal, before a second one was refused, left such files."""
-    path, given = tmp_path / "loop.journal", scans(FRESH + 2 * BLOCK)
+    path, given = tmp_path / "loop.journal", scans(FRESH + 2 * BLOCK_SCANS)
     journal = Journal(path)
     for _ in range(2):
         journal.begin(controller.manifest, controller.sha256, 1e9)
@@ -230,7 +230,7 @@ def test_a_reader_holds_one_block_at_a_time(tmp_path: Path, controller: Controll
     path = tmp_path / "loop.journal"
     journal = Journal(path)
     journal.begin(controller.manifest, controller.sha256, 1e9)
-    for scan in scans(FRESH + 30 * BLOCK):
+    for scan in scans(FRESH + 30 * BLOCK_SCANS):
         journal.scan(scan)
     journal.close()
     base = sqlite3.connect(path)
@@ -239,7 +239,7 @@ def test_a_reader_holds_one_block_at_a_time(tmp_path: Path, controller: Controll
     reader = JournalReader(path)
     found = reader.scans()
     tracemalloc.start()
-    for _ in range(3 * BLOCK):
+    for _ in range(3 * BLOCK_SCANS):
         next(found)
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -297,7 +297,7 @@ def test_what_a_full_disk_costs_is_said_and_no_run_is_lost(
     tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """More waits than may: the oldest scans go, and the rest is still of a run."""
-    monkeypatch.setattr(writer, "WAITING", 20)
+    monkeypatch.setattr(writer, "WAITING_ENTRIES", 20)
     monkeypatch.setattr(writer, "FLUSH_S", 0.001)
     told: list[str] = []
     journal = Journal(tmp_path / "loop.journal", tell=told.append)
@@ -349,7 +349,7 @@ def test_each_write_waits_for_the_disk_where_a_power_loss_must_cost_nothing(
 def test_a_write_that_hangs_makes_nothing_grow(
     tmp_path: Path, controller: Controller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(writer, "WAITING", 20)
+    monkeypatch.setattr(writer, "WAITING_ENTRIES", 20)
     monkeypatch.setattr(writer, "STALL_S", 0.0)
     told: list[str] = []
     journal = Journal(tmp_path / "loop.journal", tell=told.append)
@@ -558,7 +558,7 @@ def test_rows_about_a_gap_keep_their_ids_when_they_are_packed(
 ) -> None:
     """A file that was made again with the rows that are left has one."""
     monkeypatch.setattr(writer, "FLUSH_S", 0.001)
-    path, given = tmp_path / "loop.journal", scans(FRESH + 2 * BLOCK)
+    path, given = tmp_path / "loop.journal", scans(FRESH + 2 * BLOCK_SCANS)
     journal = written(path, controller, given[:100])
     with closing(sqlite3.connect(path)) as base:
         assert within(20, lambda: done(lambda: base.execute("delete from scan where id between 40 and 60")))

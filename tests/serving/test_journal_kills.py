@@ -32,7 +32,7 @@ from loopwright.serving.journal import writer
 from loopwright.serving.journal import EventEntry, Journal, ScanEntry, writer
 path, manifest, small = Path(sys.argv[1]), Manifest.from_json(sys.argv[2]), sys.argv[3] == "small"
 if small:
-    writer.BLOCK, writer.FRESH, writer.FLUSH_S, writer.LEAST_EVENTS = 20, 40, 0.02, 60
+    writer.BLOCK_SCANS, writer.FRESH, writer.FLUSH_S, writer.LEAST_EVENTS = 20, 40, 0.02, 60
 
 def write(statement, nth):
     journal, seen = Journal(path, max_mb=0.02 if small else 2000.0), 0

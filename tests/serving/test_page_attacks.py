@@ -350,7 +350,7 @@ def test_who_never_reads_holds_little_and_is_cut_off(loop: FakeLoop, monkeypatch
             send(app.live._send, "data: " + "x" * 50_000 + "\n\n")
         assert within(20, lambda: not server.server_state.connections)
         assert not app.live._pages
-        assert queue.qsize() <= live.WAITING
+        assert queue.qsize() <= live.WAITING_MESSAGES
         deaf.close()
         # Answers that are not taken, the same.
         script = raw(browser.port, "token", "GET /static/uPlot.iife.min.js HTTP/1.1", body=b"")

@@ -21,7 +21,7 @@ from served_plant import PERIOD_S, SPEED, begun, cut, mend, read, served, wired,
 
 from loopwright.serving import Command, Mode
 from loopwright.serving.journal import ScanEntry
-from loopwright.serving.mv_readback import SAME
+from loopwright.serving.mv_readback import SAME_READ_BACK
 from loopwright.serving.opcua.certificates import make
 
 START = 250.0  # the MV of the plant's start
@@ -104,7 +104,7 @@ def legal(found: list[ScanEntry], plant: Plant, since: int, besides: set[float])
         within_it = [s.time_s for s in group][6:]  # what was on its way has arrived, or never will
         if mode == "HOLD" and within_it:
             stood = {row["asked"][0] for row in rows if within_it[0] <= row["time"] <= within_it[-1]} - besides
-            assert not stood or max(stood) - min(stood) <= SAME * 500, stood
+            assert not stood or max(stood) - min(stood) <= SAME_READ_BACK * 500, stood
 
 
 @pytest.mark.parametrize("name", FAULTS)

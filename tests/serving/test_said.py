@@ -6,7 +6,7 @@ import threading
 
 from processes import within
 
-from loopwright.serving.station.housekeeping import WAITING, Said
+from loopwright.serving.station.housekeeping import WAITING_LINES, Said
 
 
 def test_lines_come_in_their_order_and_an_end_waits_for_them() -> None:
@@ -49,13 +49,13 @@ def test_a_reader_that_stands_still_holds_nobody_up_and_is_told_what_it_missed()
     said = Said(tell)
     said.say("first")
     assert began.wait(10)
-    for k in range(WAITING + 7):
+    for k in range(WAITING_LINES + 7):
         said.say(str(k))
     go_on.set()
-    assert within(10, lambda: len(told) == WAITING + 2)
+    assert within(10, lambda: len(told) == WAITING_LINES + 2)
     said.end()
     assert told[:2] == ["first", "0"]
-    assert told[-2:] == [str(WAITING - 1), "7 more lines were not said here: nobody read them in time"]
+    assert told[-2:] == [str(WAITING_LINES - 1), "7 more lines were not said here: nobody read them in time"]
 
 
 def test_what_was_never_used_has_no_thread() -> None:

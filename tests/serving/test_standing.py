@@ -23,11 +23,11 @@ from loopwright.serving import (
     Signal,
     VirtualClock,
 )
-from loopwright.serving.mv_readback import SAME, SETTLED, StandingMv
+from loopwright.serving.mv_readback import EQUAL_COMMANDS, SAME_READ_BACK, StandingMv
 
 pytest_plugins = ["small_laws"]
 RANGE = 100.0
-TOLERANCE = SAME * RANGE
+TOLERANCE = SAME_READ_BACK * RANGE
 
 
 class Line:
@@ -253,7 +253,7 @@ def test_a_read_back_that_lags_or_differs_does_not_make_the_mv_creep(
     """A thousand outages in which nobody moves anything."""
     line = Line(lag=lag, offset=offset)
     loop = make_loop(line, mode=mode)
-    loop.run(SETTLED + lag + 2)
+    loop.run(EQUAL_COMMANDS + lag + 2)
     for k in range(1_000):
         outage(loop, line, 1 + k % 4)
         loop.run(1 + k % 3)
@@ -296,7 +296,8 @@ def test_no_outage_moves_an_mv_that_nobody_moved_and_none_writes_over_one_that_w
 ) -> None:
     """The bound on every MV that is written after an outage of any length, whenever somebody moves the MV.
 
-    - It is where the MV stood ``lag`` periods before the first good read-back, within ``SAME`` of the range. So a move
+    - It is where the MV stood ``lag`` periods before the first good read-back, within ``SAME_READ_BACK`` of the range.
+    So a move
       that is older than the lag is never written over. A younger one is: no read-back shows it yet.
     - There is none as long as each read-back since is bad, nor where the first good one lies outside the range by more
       than ``READ_BACK_MARGIN``.
@@ -305,7 +306,7 @@ def test_no_outage_moves_an_mv_that_nobody_moved_and_none_writes_over_one_that_w
     """
     line = Line(lag=lag, offset=offset)
     loop = ControlLoop(law, line, sp=1.0, mv=40.0, mode=mode, clock=VirtualClock(), warm_lead_s=0)
-    loop.run(SETTLED + lag + 2)
+    loop.run(EQUAL_COMMANDS + lag + 2)
     for _ in range(data.draw(st.integers(1, 6))):
         stands = line.mv  # as far as a loop can know
         moved, scans = data.draw(MOVES), data.draw(st.integers(1, lag + 20))
@@ -340,7 +341,7 @@ def test_a_move_that_no_read_back_shows_yet_is_written_over(make_loop: Callable[
     """What the bound above does not promise, so that nobody takes it for more than it is."""
     line = Line(lag=2)
     loop = make_loop(line, mode=Mode.MANUAL)
-    loop.run(SETTLED + 4)
+    loop.run(EQUAL_COMMANDS + 4)
     outage(loop, line, 10, 71.0)  # moved last of all, so that the first read-back is older
     loop.run(3)
     assert line.written == [40.0] * 3
@@ -366,11 +367,11 @@ def test_what_others_moved_while_the_loop_was_a_shadow_is_no_offset(
     """The normal way in: the operator moves the MV a little, then presses AUTO. An outage then moves it by nothing."""
     line = Line()
     loop = make_loop(line, mode=Mode.SHADOW)
-    loop.run(2 * SETTLED)
+    loop.run(2 * EQUAL_COMMANDS)
     line.mv += 0.016 * RANGE
     loop.run(2)
     loop.set_mode(mode)
-    loop.run(3 * SETTLED)
+    loop.run(3 * EQUAL_COMMANDS)
     for _ in range(3):
         line.pv_bad = True
         outage(loop, line, 4, line.mv)
@@ -380,4 +381,4 @@ def test_what_others_moved_while_the_loop_was_a_shadow_is_no_offset(
         assert line.written == pytest.approx([stands] * len(line.written), abs=1e-9)
         assert line.mv == pytest.approx(stands, abs=1e-9)
         line.pv_bad = False
-        loop.run(2 * SETTLED)
+        loop.run(2 * EQUAL_COMMANDS)

@@ -16,8 +16,8 @@ from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Loop
 from loopwright.pipeline.pictures.drawing import (
     PALETTE,
+    PICTURE_SIZE,
     SET_POINT,
-    SIZE,
     CasePicture,
     Draw,
     axis_label,
@@ -40,7 +40,7 @@ def free_run_picture(evidence: Evidence) -> Canvas:
         raise NotMeasuredError
     plant = evidence.case.equations
     n = arrays["actual"].shape[1]
-    canvas = Canvas(figsize=(SIZE[0], 1.0 + 1.7 * (n + 1)), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 1.0 + 1.7 * (n + 1)), layout="constrained")
     panels = list(canvas.subplots(n + 1, 1, sharex=True))
     time, words = time_axis(np.ravel(arrays["time_s"]))
     for i, (axes, signal) in enumerate(zip(panels, plant.state_signals, strict=False)):
@@ -60,7 +60,7 @@ def phase_picture(evidence: Evidence) -> Canvas:
     found = {c.law: arrays for c in (GAINS, AUTO) if "start" in (arrays := evidence.analysis_arrays(c))}
     if not found:
         raise NotMeasuredError
-    canvas = Canvas(figsize=(SIZE[0], 5.4), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 5.4), layout="constrained")
     panels = list(np.atleast_1d(canvas.subplots(1, len(found), sharex=True, sharey=True)))
     cvs, xs, _ = evidence.case.equations.steady_curve
     for axes, (law, arrays) in zip(panels, found.items(), strict=True):
@@ -98,7 +98,7 @@ def frozen_picture(curves: Sequence[tuple[Curve, str]]) -> Draw:
         found = {words: arrays for words, arrays in kept.items() if "frozen_radius" in arrays}
         if not found:
             raise NotMeasuredError
-        canvas = Canvas(figsize=(SIZE[0], 4.6), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0], 4.6), layout="constrained")
         axes = canvas.subplots()
         for i, (words, arrays) in enumerate(found.items()):
             colour = PALETTE[i % len(PALETTE)]
@@ -133,7 +133,7 @@ def responses_picture(
     def draw(evidence: Evidence) -> Canvas:
         if not any(evidence.loop(curve, name) for curve, _ in curves for name, _ in tests):
             raise NotMeasuredError
-        canvas = Canvas(figsize=(SIZE[0], 6.4), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0], 6.4), layout="constrained")
         panels = canvas.subplots(3, len(tests), sharex="col", sharey="row", height_ratios=(3, 2, 2), squeeze=False)
         for column, (name, words) in zip(panels.T, tests, strict=True):
             for i, (curve, label) in enumerate(curves):

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure as Canvas
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Array
 from loopwright.pipeline.evaluation.verdicts import CheckOutcome
-from loopwright.pipeline.pictures.drawing import PALETTE, SIZE, legend_below
+from loopwright.pipeline.pictures.drawing import PALETTE, PICTURE_SIZE, legend_below
 from loopwright.pipeline.pictures.numbers import number
 
 SET = "hybrid_fuzzy"
@@ -58,7 +58,7 @@ def _over_centres(found: Coefficients, coefficient: str, mode: str) -> tuple[Arr
 def reach_picture(evidence: Evidence) -> Canvas:
     """The jacket's reach in one period over its temperature, in each mode, and the gap between the modes."""
     parts = _parts(evidence)
-    canvas = Canvas(figsize=(SIZE[0], 6.4), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 6.4), layout="constrained")
     grid = canvas.subplots(2, 2, sharex=True, sharey=True)
     panels = np.ravel(grid)
     for axes, (how, found) in zip(panels, parts.items(), strict=False):
@@ -97,7 +97,7 @@ def _reach(axes: Axes, found: Coefficients, how: str) -> None:
 def coefficients_picture(evidence: Evidence) -> Canvas:
     """a1, a2, b and r over the rules' centres, hot and cold, beside what the reactor itself does."""
     parts = _parts(evidence)
-    canvas = Canvas(figsize=(SIZE[0], 6.4), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 6.4), layout="constrained")
     physics: Coefficients = next(iter(parts.values()))["physics"]
     reactor: Any = {"color": "black", "linewidth": 2.4, "alpha": 0.35}
     colours = {how: colour for how, colour in COLOURS.items() if how in parts}

@@ -12,8 +12,8 @@ from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.pictures.drawing import (
     PALETTE,
+    PICTURE_SIZE,
     SET_POINT,
-    SIZE,
     CasePicture,
     Draw,
     colour_of,
@@ -43,7 +43,7 @@ def recipe_picture(curve: Curve, scenario: str) -> Draw:
     def draw(evidence: Evidence) -> Canvas:
         loop, info = evidence.info(curve, scenario, "adjusted_reference", "wanted_jacket")
         time, words = time_axis(loop["time_s"])
-        canvas = Canvas(figsize=(SIZE[0], 8.4), layout="constrained")
+        canvas = Canvas(figsize=(PICTURE_SIZE[0], 8.4), layout="constrained")
         core, jacket, throttle, mode = canvas.subplots(4, 1, sharex=True, height_ratios=(3, 2.2, 1.6, 0.6))
         core.step(time, loop["sp"][:, 0], where="post", label="set point", **SET_POINT)
         core.plot(time, loop["pv"][:, 0], color=CORE, linewidth=2.6, label="core")
@@ -74,7 +74,7 @@ def recipe_picture(curve: Curve, scenario: str) -> Draw:
 
 def switches_picture(evidence: Evidence) -> Canvas:
     """Switches of the mode, and the largest offset, over the price of a switch; a line a test."""
-    canvas = Canvas(figsize=(SIZE[0], 4.2), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 4.2), layout="constrained")
     left, right = canvas.subplots(1, 2)
     forms = [Curve(OBSERVER, {"switch_penalty": p}) for p in PENALTIES]
     for (scenario, label), colour in zip(NOISY.items(), PALETTE, strict=False):
@@ -106,7 +106,7 @@ def offsets_picture(evidence: Evidence) -> Canvas:
         {law: np.array([evidence.measured(law, test, metric) for test in OFF]) for law in LAWS}
         for metric in ("masse", "max_asse")
     )
-    canvas = Canvas(figsize=(SIZE[0], 4.4), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 4.4), layout="constrained")
     axes = canvas.subplots()
     wide = 0.8 / len(LAWS)
     for i, law in enumerate(LAWS):

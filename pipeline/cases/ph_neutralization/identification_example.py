@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.lagged.lagged import NNARX
-from loopwright.pipeline.models.lagged.one_step import FORGETTING, OneStep, compare_one_step
+from loopwright.pipeline.models.lagged.one_step import ESTIMATE_FORGETTING, OneStep, compare_one_step
 from loopwright.pipeline.models.part import Learnt, Part, Source
 from loopwright.pipeline.models.training.network_parts import trainer_of
 from loopwright.pipeline.models.training.objectives import Samples
@@ -68,7 +68,7 @@ class IdentificationExamplePart(Part):
     noise: float = 0.1
     compared: int = 100
     hidden: tuple[int, ...] = (10,)
-    forgetting: tuple[float, ...] = FORGETTING
+    forgetting: tuple[float, ...] = ESTIMATE_FORGETTING
     train_fraction: float = 0.7
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm", "iterations": 300})
 

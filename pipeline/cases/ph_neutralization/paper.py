@@ -12,7 +12,7 @@ from loopwright.pipeline.evaluation.case import Curve, PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
 from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
-from loopwright.pipeline.pictures.loop_pictures import LONGEST
+from loopwright.pipeline.pictures.loop_pictures import LONGEST_PID_TIME
 from loopwright.pipeline.pictures.numbers import number, ratio
 from loopwright.pipeline.pictures.words import curve_label
 
@@ -143,7 +143,7 @@ def _buffer_flow(evidence: Evidence) -> CheckOutcome:
 def _at_bounds(evidence: Evidence) -> CheckOutcome:
     """The share of samples in which the best move needs a negative gain: a bound is active there."""
     _, info = evidence.info(ADAPTIVE, SET, "kc", "tau_i_s", "tau_d_s")
-    too_long = info["tau_i_s"] > LONGEST * evidence.case.plant.period_s
+    too_long = info["tau_i_s"] > LONGEST_PID_TIME * evidence.case.plant.period_s
     share = float(np.mean((info["kc"] <= 0) | too_long | (info["tau_d_s"] <= 0)))
     because = "without bounds, many settings give the same move; the law takes the one with the smallest change"
     return CheckOutcome(f"a bound is active in {100 * share:.0f} % of the samples on {SET}", share > 0, because)

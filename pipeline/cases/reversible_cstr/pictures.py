@@ -14,10 +14,10 @@ from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Array, Loop
 from loopwright.pipeline.evaluation.verdicts import CheckOutcome
 from loopwright.pipeline.pictures.drawing import (
+    PICTURE_SIZE,
     REFERENCE,
     SET_POINT,
     SHADES,
-    SIZE,
     CasePicture,
     axis_label,
     clear_legend,
@@ -40,7 +40,7 @@ HEAD = ("order", "found: coefficients of $s^{n-1}..s^1$", "ITAE", "classic table
 
 def reference_models_picture(evidence: Evidence) -> Canvas:
     """Step responses of orders 1 to 6, found and classic, and the table of their coefficients and ITAE."""
-    canvas = Canvas(figsize=(SIZE[0], 6.4), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 6.4), layout="constrained")
     responses, table = canvas.subplots(2, 1, height_ratios=(2.2, 1))
     for order, colour in zip(ORDERS, SHADES, strict=True):
         for model, line in ((ReferenceModel.optimal(order), "-"), (ReferenceModel.classic(order), ":")):
@@ -118,7 +118,7 @@ def levels_picture(evidence: Evidence) -> Canvas:
     """Set point, reference model and CV of each law; the distance from the reference; the MV."""
     loops, reference = _on_levels(evidence), _reference(evidence)
     cv, mv = evidence.case.plant_class.sp_signals[0], evidence.case.plant_class.mv_signals[0]
-    canvas = Canvas(figsize=(SIZE[0], 8.0), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 8.0), layout="constrained")
     course, distance, move = canvas.subplots(3, 1, sharex=True, height_ratios=(2.2, 1.6, 1.4))
     time, words = time_axis(loops[0][2]["time_s"])
     course.step(time, loops[0][2]["sp"][:, 0], where="post", label="set point", zorder=2, **SET_POINT)
@@ -147,7 +147,7 @@ def disturbances_picture(evidence: Evidence) -> Canvas:
     if not measured:
         raise NotMeasuredError
     rows = -(-len(measured) // 2)
-    canvas = Canvas(figsize=(SIZE[0], 1.4 + 2.8 * rows), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 1.4 + 2.8 * rows), layout="constrained")
     panels = canvas.subplots(rows, 2, squeeze=False).ravel()
     cv = evidence.case.plant_class.sp_signals[0]
     shown: dict[str, Any] = {}
@@ -172,7 +172,7 @@ def disturbances_picture(evidence: Evidence) -> Canvas:
 def offsets_picture(evidence: Evidence) -> Canvas:
     """Mean error over the last samples of each level against the level: what a law without memory leaves."""
     cv = evidence.case.plant_class.sp_signals[0]
-    canvas = Canvas(figsize=(SIZE[0], 3.8), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 3.8), layout="constrained")
     axes = canvas.subplots()
     for rank, (label, colour, loop) in enumerate(_on_levels(evidence)):
         sp, error = loop["sp"][:, 0], loop["sp"][:, 0] - loop["pv"][:, 0]
@@ -192,7 +192,7 @@ def training_picture(evidence: Evidence) -> Canvas:
     histories = {name: a for name, a in arrays.items() if "history" in a}
     if not histories:
         raise NotMeasuredError
-    canvas = Canvas(figsize=(SIZE[0], 4.2), layout="constrained")
+    canvas = Canvas(figsize=(PICTURE_SIZE[0], 4.2), layout="constrained")
     axes = canvas.subplots()
     for name, values in histories.items():
         history, best = values["history"], int(values["best"][0])

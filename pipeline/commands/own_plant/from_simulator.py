@@ -70,10 +70,12 @@ def judged_record(
 
 
 # ------------------------------------------------------------------------------------------------------ the experiment
-SLOW, WANTED = 120, 60  # periods of the settling time: above the first, the period becomes long enough for the second
+
+# periods of the settling time: above the first, the period becomes long enough for the second
+SLOW_SETTLING, WANTED_SETTLING = 120, 60
 LONGER = (10, 100, 1000)  # steps of a simulator in a period, tried where it does not settle
 RESTS_AFTER = (2, 8)  # settling times at an FMU's start values, tried where its start is no rest
-SEED = 0  # of the experiment
+EXPERIMENT_SEED = 0  # of the experiment
 SIMULATOR = "simulator"  # its copy beside the record, with the ending of the file
 
 
@@ -102,7 +104,7 @@ def simulated(plant: FileSimulator, rows: int, period_s: float | None) -> Simula
     if plant.table and not test.at_rest:
         plant, test = _rested(plant, plant.table, test)
     plan = planned(plant, test, rows)
-    record = excited(plant, plan, SEED)
+    record = excited(plant, plan, EXPERIMENT_SEED)
     files = [{"file": str(plant.path), "sha256": sha256(plant.path)}]
     found = judged_record(plant.name, record, files, _findings(plant, test, plan), "simulated")
     return Simulated(plant, test, plan, found)
@@ -145,8 +147,8 @@ def copy_name(simulator: Path) -> str:
 
 def _every(plant: FileSimulator, test: FirstTest, period_s: float | None) -> int:
     if period_s is None:
-        slow = test.settles and test.settling_periods > SLOW
-        return round(test.settling_periods / WANTED) if slow else 1
+        slow = test.settles and test.settling_periods > SLOW_SETTLING
+        return round(test.settling_periods / WANTED_SETTLING) if slow else 1
     every = round(period_s / plant.period_s)
     if every < 1 or abs(every * plant.period_s - period_s) > 1e-6 * period_s:
         raise RecordError(f"--period {period_s:g}: give a multiple of the simulator's period, {plant.period_s:g} s")
@@ -159,7 +161,9 @@ def _findings(plant: FileSimulator, test: FirstTest, plan: ExperimentPlan) -> li
         f"settles within {k} periods of {h:g} s" if test.settles else f"does not settle; {k} periods to move a tenth"
     )
     if plant.every > 1:
-        words += f"; the period is {plant.every} steps of the simulator, so that an answer takes {WANTED} or so"
+        words += (
+            f"; the period is {plant.every} steps of the simulator, so that an answer takes {WANTED_SETTLING} or so"
+        )
     found = [Finding("first_test", plant.name, words)]
     if plant.table and plant.table.rest_periods:
         rest_s = plant.table.rest_periods * plant.table.step_s

@@ -111,8 +111,8 @@ class Actuators:
 
 
 NOISE = (0.5, 2.0)  # times the case's measurement noise
-LATE = 0.5  # share of the loops with one more sample of dead time
-MOST_LEVELS = 2  # of a test, of which a random set point is a mixture
+LATE_LOOPS = 0.5  # share of the loops with one more sample of dead time
+MIXED_LEVELS = 2  # of a test, of which a random set point is a mixture
 
 Range = tuple[float, float]
 
@@ -204,7 +204,7 @@ class Drawing:
         test = self.tests[name][int(rng.integers(len(self.tests[name])))]
         plant, share = self.plant_of(test), float(rng.uniform())
         parameters = {key: float(rng.uniform(*ends)) for key, ends in self.ranges(plant).items()}
-        noise, late = float(rng.uniform(*NOISE)), bool(rng.uniform() < LATE)
+        noise, late = float(rng.uniform(*NOISE)), bool(rng.uniform() < LATE_LOOPS)
         faulty = bool(rng.uniform() < self.faults)
         fault = draw_fault(rng, plant.mv_signals, test.samples)
         nominal = dict(zip(plant.parameter_names(), plant.parameters(), strict=True))
@@ -232,7 +232,7 @@ def _set_points(rng: np.random.Generator, test: Scenario) -> Array:
     levels = test.sp[:: test.hold]
     if not np.any(levels != levels[0]):
         return test.sp
-    pairs = rng.integers(len(levels), size=(len(levels), MOST_LEVELS))
+    pairs = rng.integers(len(levels), size=(len(levels), MIXED_LEVELS))
     weight = rng.uniform(size=(len(levels), 1))
     drawn = weight * levels[pairs[:, 0]] + (1 - weight) * levels[pairs[:, 1]]
     drawn[0] = levels[0]  # where the plant rests

@@ -14,16 +14,16 @@ from loopwright.pipeline.evaluation.stress.draws import Draw
 from loopwright.pipeline.evaluation.stress.loops import StressOutcome, figures_of
 from loopwright.pipeline.plants.simulator import Array
 
-QUANTILES = (0.05, 0.5, 0.9, 0.99, 1.0)  # of a figure over the loops of one test or of all, the largest value last
+LOOP_QUANTILES = (0.05, 0.5, 0.9, 0.99, 1.0)  # of a figure over the loops of one test or of all, the largest value last
 WORST = 10  # loops that are listed, the worst first
-BINS = 5  # equal shares of the loops along a drawn quantity
+DRAWN_BINS = 5  # equal shares of the loops along a drawn quantity
 LEAST_LOOPS = 4  # in a share whose median is shown
 NO_FAULT = "none"
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A figure over loops: its values at QUANTILES; of ``loops`` loops."""
+    """A figure over loops: its values at LOOP_QUANTILES; of ``loops`` loops."""
 
     metric: str
     test: str  # empty: all tests
@@ -111,7 +111,7 @@ class Summary:
         values = figures_of(self.outcomes, metric)[places]
         values = values[~np.isnan(values)]
         found = tuple(
-            float(np.median(values) if q == 0.5 else np.quantile(values, q, method="higher")) for q in QUANTILES
+            float(np.median(values) if q == 0.5 else np.quantile(values, q, method="higher")) for q in LOOP_QUANTILES
         )
         return Spread(metric, test, len(values), found)
 
@@ -148,10 +148,10 @@ class Summary:
         distinct = np.unique(values[known])
         if len(distinct) < 2 or len(known) < 2 * LEAST_LOOPS:
             return None
-        if len(distinct) <= BINS:
+        if len(distinct) <= DRAWN_BINS:
             groups = [known[values[known] == v] for v in distinct]
         else:
-            shares = min(BINS, len(known) // LEAST_LOOPS)
+            shares = min(DRAWN_BINS, len(known) // LEAST_LOOPS)
             groups = list(np.array_split(known[np.argsort(values[known], kind="stable")], shares))
         return _grown(name, tuple(float(np.median(values[g])) for g in groups), [self.relative[g] for g in groups])
 

@@ -12,7 +12,7 @@ from loopwright.pipeline.export.fusion.joining import joined
 from loopwright.pipeline.export.fusion.plan import Item
 from loopwright.pipeline.export.fusion.reading import GraphReading
 
-LEAST_SHARE = 0.002
+LEAST_SAVING = 0.002
 """A graph must save this share of its price; else it stays as it is."""
 
 
@@ -34,7 +34,7 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
             if not reading.without_factors:  # the next would be the same
                 break
     after, items, outputs, _ = min(candidates, key=lambda c: c[0])
-    if after > (1 - LEAST_SHARE) * candidates[0][3].price_before:
+    if after > (1 - LEAST_SAVING) * candidates[0][3].price_before:
         return model
     return emitted(items, outputs, model)
 

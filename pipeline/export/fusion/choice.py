@@ -17,7 +17,7 @@ PREFERENCES = (
     ("selection", "elementwise", "squares", "segments", "increment", "row", "group", "gather", "recipe"),
 )
 SWEEPS = 4  # over all choices, each with the others as they are
-LEAST_GAIN = 0.01  # ns
+LEAST_GAIN_NS = 0.01  # ns
 
 
 def choose(choices: list[FormChoice], roots: list[Item]) -> float:
@@ -44,7 +44,7 @@ def _sweep(account: Account, choices: list[FormChoice]) -> None:
         for choice in latest_first:
             if choice.count:
                 _improve(account, choice)
-        if account.total > before - LEAST_GAIN:
+        if account.total > before - LEAST_GAIN_NS:
             break
 
 
@@ -54,7 +54,7 @@ def _improve(account: Account, choice: FormChoice) -> None:
     for kind in choice.forms:
         if kind != best:
             account.choose(choice, kind)
-            if account.total < least - LEAST_GAIN:
+            if account.total < least - LEAST_GAIN_NS:
                 best, least = kind, account.total
     if choice.kind != best:
         account.choose(choice, best)
@@ -79,7 +79,7 @@ def _without(account: Account, roots: list[Item]) -> None:
         account.drop(root)
 
 
-LEVELS = 3  # so much later at most
+LATER_LEVELS = 3  # so much later at most
 
 
 def postpone(items: Items, decided: Sequence[tuple[FormChoice, AffineValue]]) -> None:
@@ -93,7 +93,7 @@ def postpone(items: Items, decided: Sequence[tuple[FormChoice, AffineValue]]) ->
     last = max((block.level for block in items.reading.blocks), default=0)
     for choice, value in decided:
         if "group" in choice.forms:
-            end = min(first_user.get(id(choice), last + 1) - 1, value.level + LEVELS)
+            end = min(first_user.get(id(choice), last + 1) - 1, value.level + LATER_LEVELS)
             for level in range(value.level + 1, end + 1):
                 choice.forms[f"later {level - value.level}"] = items.member(value, level=level)
 

@@ -26,7 +26,7 @@ from loopwright.pipeline.export.fusion.affine import (
 from loopwright.pipeline.export.fusion.items import Items
 from loopwright.pipeline.export.fusion.plan import Input, Item
 
-TERMS = 3  # blocks of an elementwise form at most
+ELEMENTWISE_BLOCKS = 3  # blocks of an elementwise form at most
 RUNS = 8  # pieces of a value put together from runs at most
 MOVING = frozenset({"Slice", "Split", "Gather"})
 
@@ -63,7 +63,7 @@ def _selection(items: Items, value: AffineValue) -> Item | None:
 
 def _sum(items: Items, affine: Affine, start: Item | None) -> Item | None:
     """``start`` plus factors times blocks plus a constant, element by element; None where elements mix."""
-    if len(affine.parts) > TERMS:
+    if len(affine.parts) > ELEMENTWISE_BLOCKS:
         return None
     plain, scaled, negative = [], [], []
     for number, matrix in affine.parts.items():

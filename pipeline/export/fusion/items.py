@@ -22,8 +22,7 @@ from loopwright.pipeline.export.fusion.plan import (
 )
 from loopwright.pipeline.export.fusion.pools import Group, SelectionPool  # fmt: skip
 from loopwright.pipeline.export.fusion.reading import GraphReading
-
-INT64 = 7  # ONNX's number of the type
+from loopwright.serving.graph.work import INT64
 
 
 class Items:

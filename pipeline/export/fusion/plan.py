@@ -173,7 +173,7 @@ FIXED = {
 }  # fmt: skip
 INPUT, OUTPUT = 90.0, 155.0  # of a Concat, of a Split
 # Price of a product, of a multiply-add, of one in a large product; factor of many rows.
-PRODUCT, MULTIPLY_ADD, LARGE, BATCHED = 415.0, 0.21, 0.35, 0.4
+PRODUCT, MULTIPLY_ADD, LARGE_MULTIPLY_ADD, BATCHED = 415.0, 0.21, 0.35, 0.4
 LARGE_FROM = 4_000  # multiply-adds
 
 
@@ -200,5 +200,5 @@ def product(left: Shape, right: Shape, out: Shape) -> float:
     inner = left[-1]
     rows = max(1, prod(out) // max(columns, 1))
     work = rows * inner * -(-columns // 8) * 8
-    each = (LARGE if work > LARGE_FROM else MULTIPLY_ADD) * (BATCHED if rows > 1 else 1.0)
+    each = (LARGE_MULTIPLY_ADD if work > LARGE_FROM else MULTIPLY_ADD) * (BATCHED if rows > 1 else 1.0)
     return PRODUCT + each * work

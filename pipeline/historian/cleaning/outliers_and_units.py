@@ -16,8 +16,8 @@ from loopwright.pipeline.metrics import Array
 
 Where = NDArray[np.bool_]
 
-SAMPLE = 200_000  # readings that a distribution is estimated from
-WINDOW = 9  # readings of the running median
+RANGE_SAMPLE = 200_000  # readings that a distribution is estimated from
+MEDIAN_OF = 9  # readings of the running median
 SPIKE_SD, SPIKE_SPAN = 8.0, 0.03  # of the residual's robust sd, and of the usual span
 LONGEST_SPIKE = 4  # readings
 CONVERSIONS: dict[str, tuple[float, float]] = {
@@ -48,7 +48,7 @@ MATCH_SD, MATCH_SHARE = 6.0, 0.05  # how near the conversion must come: noise, a
 
 def usual(values: Array) -> tuple[float, float]:
     """1 % and 99 % quantile of finite values; (0, 0) where there are none."""
-    step = max(1, len(values) // SAMPLE)
+    step = max(1, len(values) // RANGE_SAMPLE)
     sample = values[::step]
     sample = sample[np.isfinite(sample)]
     if not sample.size:
@@ -59,7 +59,7 @@ def usual(values: Array) -> tuple[float, float]:
 
 def core(values: Array) -> tuple[float, float]:
     """Where the middle 90 % lie after values that are more than ten of their spans away have gone."""
-    sample = values[:: max(1, len(values) // SAMPLE)]
+    sample = values[:: max(1, len(values) // RANGE_SAMPLE)]
     sample = sample[np.isfinite(sample)]
     if not sample.size:
         return 0.0, 0.0
@@ -104,7 +104,7 @@ def unit_slips(values: Array, kinds: Sequence[str] = ()) -> tuple[Where, Counter
     low, high = core(values)
     noise = max(noise_sd(values), 1e-12)
     jumps = np.flatnonzero(np.abs(step) > max(JUMP_SD * noise, JUMP_SPAN * (high - low) * 0.5))
-    slack = MATCH_SD * noise + float(np.quantile(np.abs(step[:: max(1, n // SAMPLE)]), 0.99))
+    slack = MATCH_SD * noise + float(np.quantile(np.abs(step[:: max(1, n // RANGE_SAMPLE)]), 0.99))
     matched = [
         (int(k), _conversion(values[k], values[k + 1], slack, kinds or tuple(CONVERSIONS))) for k in jumps[:2000]
     ]
@@ -112,7 +112,9 @@ def unit_slips(values: Array, kinds: Sequence[str] = ()) -> tuple[Where, Counter
     others = np.ones(n, dtype=bool)
     for a, b, _ in stretches:
         others[a:b] = False
-    usual_range = np.quantile(values[others][:: max(1, n // SAMPLE)], [0.05, 0.95]) if others.any() else (0.0, 0.0)
+    usual_range = (
+        np.quantile(values[others][:: max(1, n // RANGE_SAMPLE)], [0.05, 0.95]) if others.any() else (0.0, 0.0)
+    )
     for a, b, kind in stretches:
         if LONGEST_SPIKE < b - a <= n // 2 and others.sum() >= n // 3 and _plausible(values[a:b], usual_range, kind):
             where[a:b] = True
@@ -175,17 +177,17 @@ def _returns(kind: str, other: str) -> bool:
 
 
 def outliers(values: Array) -> Where:
-    """Where (n,) a reading stands alone: far from the running median of WINDOW readings, for at most LONGEST_SPIKE.
+    """Where (n,) a reading stands alone: far from the running median of MEDIAN_OF readings, for at most LONGEST_SPIKE.
 
     values (n,) finite. Far is more than 8 robust standard deviations of such residuals and 3 % of the usual span, so
     that a smooth peak without noise is none.
     """
-    if len(values) < WINDOW:
+    if len(values) < MEDIAN_OF:
         return np.zeros(len(values), dtype=bool)
     from scipy.ndimage import median_filter  # half a second to load
 
-    residual = np.abs(values - median_filter(values, WINDOW, mode="nearest"))
-    sample = residual[:: max(1, len(residual) // SAMPLE)]
+    residual = np.abs(values - median_filter(values, MEDIAN_OF, mode="nearest"))
+    sample = residual[:: max(1, len(residual) // RANGE_SAMPLE)]
     low, high = core(values)
     limit = max(SPIKE_SD * 1.4826 * float(np.median(sample)), SPIKE_SPAN * (high - low), SPIKE_SD * noise_sd(values))
     limit = max(limit, 1e-12 * max(abs(low), abs(high)))

@@ -44,17 +44,17 @@ def check_modes(without: Sequence[str], tags: Sequence[Tag], own: Mapping[str, S
 
 
 # ----------------------------------------------------------- windows of a long record, for what need not see every row
-WINDOWED, WINDOW = 200_000, 20_000  # rows
+WINDOWED, RECORD_WINDOW = 200_000, 20_000  # rows
 STRETCHES = 4  # of the readings of a long export
 
 
 def evenly(record: Record) -> Record:
-    """The record, or of one with more than WINDOWED rows windows of WINDOW rows, each with runs of its own."""
+    """The record, or of one with more than WINDOWED rows windows of RECORD_WINDOW rows, each with runs of its own."""
     n = len(record)
     if n <= WINDOWED:
         return record
-    starts = np.linspace(0, n - WINDOW, WINDOWED // WINDOW).astype(np.int64)
-    rows = (starts[:, None] + np.arange(WINDOW)).ravel()
+    starts = np.linspace(0, n - RECORD_WINDOW, WINDOWED // RECORD_WINDOW).astype(np.int64)
+    rows = (starts[:, None] + np.arange(RECORD_WINDOW)).ravel()
     fresh = np.r_[True, (np.diff(rows) != 1) | (np.diff(record.run[rows]) != 0)]
     taken = {name: getattr(record, name)[rows] for name in ("time_s", "pv", "mv", "dv")}
     return replace(record, run=np.cumsum(fresh, dtype=np.int64) - 1, **taken)
@@ -153,7 +153,7 @@ def _inside(time_s: NDArray[np.float64], span: Span) -> NDArray[np.bool_]:
 # ----------------------------------------------------------------------- stuck and saturated stretches, and the record
 OVERFLOWS = f"where the plant ends there, as a tank that overflows, {KEEP}"
 SHORTEST_RUN = 20  # rows
-PAD = 0.1  # of the span, beyond the values seen, in a range that was not given
+RANGE_PAD = 0.1  # of the span, beyond the values seen, in a range that was not given
 
 
 def mask_stuck_and_saturated(grid: Grid, signals: Sequence[Tag], rates: Mapping[str, TagSampling]) -> list[Finding]:
@@ -289,7 +289,7 @@ def _signal(tag: Tag, values: Array) -> Signal:
     if tag.unit == "%" and low >= 0 and high <= 100:
         low, high = 0.0, 100.0
     elif tag.role != "mv":
-        pad = PAD * (high - low)
+        pad = RANGE_PAD * (high - low)
         low, high = (float(f"{v:.3g}") for v in (low - pad, high + pad))
     # A given end may lie on the wrong side of values that nothing forbids.
     if not (low if tag.low is None else tag.low) < (high if tag.high is None else tag.high):

@@ -18,7 +18,7 @@ from loopwright.pipeline.metrics import Array
 
 FOLDS = (2, 2, 2, 3)  # factors of the rows that must repeat: keys of so many rows are made of keys of fewer
 WINDOW = math.prod(FOLDS)  # rows that must repeat
-DIFFERENT = 16  # changes of the value among them
+DISTINCT_CHANGES = 16  # changes of the value among them
 FACTOR = 0x9E3779B97F4A7C15  # of the hash of a block: 2^64 over the golden ratio, which spreads keys evenly
 
 
@@ -51,14 +51,15 @@ def flag_copies(own: Mapping[str, Series], tags: Sequence[Tag]) -> list[Finding]
 def copied(values: Array, rows: NDArray[np.uint64]) -> NDArray[np.bool_]:
     """Where (n,) rows repeat WINDOW earlier ones or more, in the same order; ``rows`` (n,) are their keys.
 
-    A window counts where the value (n,) changes DIFFERENT times or more: noise does not repeat by chance, a rest does.
+    A window counts where the value (n,) changes DISTINCT_CHANGES times or more: noise does not repeat by chance, a rest
+    does.
     """
     n = len(values)
     where = np.zeros(n, dtype=bool)
     if n < 2 * WINDOW:
         return where
     changes = np.r_[np.int32(0), np.cumsum(np.diff(values) != 0, dtype=np.int32)]
-    first = np.flatnonzero(changes[WINDOW - 1 :] - changes[: n - WINDOW + 1] >= DIFFERENT)
+    first = np.flatnonzero(changes[WINDOW - 1 :] - changes[: n - WINDOW + 1] >= DISTINCT_CHANGES)
     if not first.size:
         return where
     keys = _keys(rows)[first]

@@ -15,15 +15,16 @@ from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import runs_of
 from loopwright.pipeline.metrics import Array
 
-SHORTEST, LONGEST, SETTLINGS = 60, 400, 2.0  # rows of a window, in rows and in settling times
+SHORTEST_WINDOW, LONGEST_WINDOW, WINDOW_SETTLINGS = 60, 400, 2.0  # rows of a window, in rows and in settling times
 STEPS = 4  # a window begins at every quarter of one
-WHOLE = 0.7  # of a window's rows must have both values
+WHOLE_WINDOW = 0.7  # of a window's rows must have both values
 TRUSTED = 0.8  # median share of the variance that the inputs explain in a window: else nothing is judged
-ELSEWHERE, OTHERS = 0.6, 3  # explained share of at least this, in at least so many windows of the same region
+# explained share of at least this, in at least so many windows of the same region
+EXPLAINED_SHARE, OTHER_WINDOWS = 0.6, 3
 COVERED = 0.6  # of a window's expected range, that a window of the same region must cover
-SMALL, HIGH = 0.3, 0.5  # one motion against another, and correlations
-EDGE = 6.0  # medians of the residual
-MOST = 0.4  # of the rows: more are no exception
+SMALL_MOTION, HIGH_CORRELATION = 0.3, 0.5  # one motion against another, and correlations
+RESIDUAL_EDGE = 6.0  # medians of the residual
+MOST_CONTRADICTED = 0.4  # of the rows: more are no exception
 WORDS = {
     "no answer": "does not answer to its inputs as it does elsewhere: a dead sensor or a closed loop around another",
     "no cause": "moves while its inputs rest: a frozen input, or a load that nobody measures",
@@ -71,7 +72,7 @@ class MotionWindows:
         sd, motion = np.sqrt(np.maximum(vv, 0.0)), np.sqrt(np.maximum(ee, 0.0))
         both = ve / np.maximum(sd * motion, 1e-300)
         share = 1.0 - (vv + ee - 2 * ve) / np.maximum(vv, 1e-300)
-        keep = count >= WHOLE * STEPS * part
+        keep = count >= WHOLE_WINDOW * STEPS * part
         start = np.arange(m - STEPS + 1, dtype=np.int64) * part
         return cls(STEPS * part, start[keep], *(a[keep] for a in (sd, motion, both, share, low, high)))
 
@@ -89,7 +90,7 @@ def contradict(
         y = np.where(grid.code[tag.tag] == 0, grid.value[tag.tag], np.nan)
         if tag.tag in grid.limits:
             y[grid.limits[tag.tag]] = np.nan  # there it answers to nothing by right
-        length = int(np.clip(SETTLINGS * settling.get(tag.tag, 0), SHORTEST, LONGEST))
+        length = int(np.clip(WINDOW_SETTLINGS * settling.get(tag.tag, 0), SHORTEST_WINDOW, LONGEST_WINDOW))
         windows = MotionWindows.of(y, expected[tag.tag], length)
         for kind, rows in _judged(windows, len(y)).items():
             if kind == "no cause":
@@ -122,7 +123,7 @@ def _with_its_rest(rows: NDArray[np.bool_], inputs: Sequence[Array]) -> NDArray[
 
 def _to_its_edges(rows: NDArray[np.bool_], residual: Array, most: int) -> NDArray[np.bool_]:
     """The rows, and up to ``most`` on each side as long as half of the residuals (n,) stay beyond what is usual."""
-    far = residual > EDGE * float(np.nanmedian(residual[~rows]))
+    far = residual > RESIDUAL_EDGE * float(np.nanmedian(residual[~rows]))
     out = rows.copy()
     for a, b in zip(*runs_of(rows), strict=True):
         out[a - _reach(far[max(a - most, 0) : a][::-1]) : b + _reach(far[b : b + most])] = True
@@ -138,17 +139,21 @@ def _reach(far: NDArray[np.bool_]) -> int:
 
 def _judged(w: MotionWindows, n: int) -> dict[str, NDArray[np.bool_]]:
     """Rows (n,) by kind; none where the inputs explain the PV badly, or too many rows are struck."""
-    if len(w.start) < 2 * OTHERS:
+    if len(w.start) < 2 * OTHER_WINDOWS:
         return {}
-    moving = np.maximum(w.actual, w.expected) > SMALL * float(np.median(w.actual))
+    moving = np.maximum(w.actual, w.expected) > SMALL_MOTION * float(np.median(w.actual))
     if not moving.any() or float(np.median(w.share[moving])) < TRUSTED:
         return {}
     usual = float(np.median(w.expected[moving]))
-    silent, alone = w.actual < SMALL * w.expected, w.expected < SMALL * w.actual
+    silent, alone = w.actual < SMALL_MOTION * w.expected, w.expected < SMALL_MOTION * w.actual
     kinds = {
-        "no answer": moving & silent & (np.abs(w.correlation) < SMALL) & (w.expected > SMALL * usual),
-        "no cause": moving & alone & (w.correlation < HIGH) & (w.actual > SMALL * usual),
-        "other sign": moving & ~silent & ~alone & (w.correlation < -HIGH) & (w.actual > SMALL * usual),
+        "no answer": moving & silent & (np.abs(w.correlation) < SMALL_MOTION) & (w.expected > SMALL_MOTION * usual),
+        "no cause": moving & alone & (w.correlation < HIGH_CORRELATION) & (w.actual > SMALL_MOTION * usual),
+        "other sign": moving
+        & ~silent
+        & ~alone
+        & (w.correlation < -HIGH_CORRELATION)
+        & (w.actual > SMALL_MOTION * usual),
     }
     found = {}
     struck = np.zeros(n, dtype=bool)
@@ -159,7 +164,7 @@ def _judged(w: MotionWindows, n: int) -> dict[str, NDArray[np.bool_]]:
                 rows[w.start[i] : w.start[i] + w.length] = True
         found[kind] = rows & ~struck
         struck |= rows
-    return found if struck.mean() <= MOST else {}
+    return found if struck.mean() <= MOST_CONTRADICTED else {}
 
 
 def _explained_elsewhere(w: MotionWindows, i: int) -> bool:
@@ -167,5 +172,5 @@ def _explained_elsewhere(w: MotionWindows, i: int) -> bool:
     span = max(float(w.high[i] - w.low[i]), 1e-300)
     covered = (np.minimum(w.high, w.high[i]) - np.maximum(w.low, w.low[i])) / span
     same = (covered >= COVERED) & (np.abs(w.start - w.start[i]) >= w.length)
-    good = same & (w.share >= ELSEWHERE)
-    return int(good.sum()) >= OTHERS and good.sum() >= 0.5 * same.sum()
+    good = same & (w.share >= EXPLAINED_SHARE)
+    return int(good.sum()) >= OTHER_WINDOWS and good.sum() >= 0.5 * same.sum()

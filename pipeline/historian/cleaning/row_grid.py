@@ -21,12 +21,13 @@ from loopwright.pipeline.historian.files.numbers import Codes
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.metrics import Array
 
-MOST_ROWS, MOST_ROWS_A_READING = 20_000_000, 20  # in all, and for each reading: a record of more is mostly filled in
+# in all, and for each reading: a record of more is mostly filled in
+MOST_GRID_ROWS, MOST_ROWS_A_READING = 20_000_000, 20
 THINNED = 1.9  # readings a period from which PVs are averaged
 LEAST_PIECE = 2  # rows
-ENOUGH = 0.3  # of the usual readings of a period, for their mean
-LONG = 1_000_000  # rows
-CHUNK = 500_000  # rows
+ENOUGH_READINGS = 0.3  # of the usual readings of a period, for their mean
+LONG_GRID = 1_000_000  # rows
+GRID_CHUNK = 500_000  # rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +56,7 @@ class Grid:
 
     def lighten(self, tag: str) -> None:
         """Keep single precision of a long tag: enough for what is only drawn from here on."""
-        if len(self) > LONG:
+        if len(self) > LONG_GRID:
             self.value[tag] = self.value[tag].astype(np.float32)
 
 
@@ -117,7 +118,7 @@ def _times(pv: Sequence[Series], h: float, gap_s: float) -> tuple[Array, NDArray
     cuts = np.flatnonzero(np.diff(clock) > gap_s) + 1
     starts, ends = np.r_[0, cuts], np.r_[cuts, len(clock)]
     rows = (clock[ends - 1] - clock[starts]) / h + 1
-    if rows.sum() > min(MOST_ROWS, MOST_ROWS_A_READING * len(clock)):
+    if rows.sum() > min(MOST_GRID_ROWS, MOST_ROWS_A_READING * len(clock)):
         raise RecordError(
             f"a period of {h:g} s gives {rows.sum():.3g} rows from {len(clock)} readings; give a longer --period"
         )
@@ -151,7 +152,7 @@ def _own_times(t: Array, number: NDArray[np.int64], step_s: float, factor: int) 
 
     The first stamp is none where the mean up to it would miss too many readings.
     """
-    first = factor if factor * ENOUGH > 1 else 0
+    first = factor if factor * ENOUGH_READINGS > 1 else 0
     row = np.arange(first, int(number[-1]) + (factor + 1) // 2, factor, dtype=np.float64)
     if len(row) == len(t) == number[-1] + 1:
         return t
@@ -180,14 +181,14 @@ def _good(s: Series, rows: slice = slice(None)) -> tuple[Array, Array]:
 def _in_chunks(
     rule: Callable[..., tuple[Array, NDArray[np.bool_]]], at: Array, middle: Array, s: Series, h: float, hold_s: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """The rule over CHUNK rows at a time, and the readings that these rows can see.
+    """The rule over GRID_CHUNK rows at a time, and the readings that these rows can see.
 
     Its steps need several times the memory of its result.
     """
     out, over = np.empty(len(at)), np.empty(len(at), dtype=bool)
     reach = hold_s + 2 * h
-    for i in range(0, len(at), CHUNK):
-        own = slice(i, min(i + CHUNK, len(at)))
+    for i in range(0, len(at), GRID_CHUNK):
+        own = slice(i, min(i + GRID_CHUNK, len(at)))
         first, last = np.searchsorted(s.time_s, (at[own.start] - reach, at[own.stop - 1] + reach))
         out[own], over[own] = rule(at[own], middle[own], *_good(s, slice(first, last)), h, hold_s)
     return out, over
@@ -225,7 +226,7 @@ def _mean(at: Array, t: Array, v: Array, h: float, later_s: float = 0.0) -> tupl
     count = np.bincount(row[inside], minlength=len(at))
     total = np.bincount(row[inside], weights=v[inside], minlength=len(at))
     usual = np.median(count[count > 0]) if count.any() else 1.0
-    enough = count >= max(1.0, ENOUGH * usual)
+    enough = count >= max(1.0, ENOUGH_READINGS * usual)
     return np.where(enough, total / np.maximum(count, 1), np.nan), enough & (count < 0.7 * usual)
 
 

@@ -15,15 +15,15 @@ from loopwright.pipeline.historian.files.signal_statistics import quantum, stair
 from loopwright.pipeline.metrics import Array
 
 # ------------------------------------------------ a clock of readings, and the row of each, however long the record is
-GAP = 20.0  # steps, from which a window of stamps says nothing of the step
-FIRST, WIDER = 16, 4  # stamps of the first windows, and by how much each next ones are longer
-COHERENT = 0.4  # length of the mean of exp(2 pi i phase), from which stamps keep time
-WANDERS = 0.8  # of that of shorter windows: less is a clock that wanders, and longer ones say no more
+STAMP_GAP = 20.0  # steps, from which a window of stamps says nothing of the step
+FIRST_STAMPS, WIDER_STAMPS = 16, 4  # stamps of the first windows, and by how much each next ones are longer
+CLOCK_COHERENCE = 0.4  # length of the mean of exp(2 pi i phase), from which stamps keep time
+CLOCK_WANDERS = 0.8  # of that of shorter windows: less is a clock that wanders, and longer ones say no more
 EXACT = 1e-3  # ratio of two steps that count as one: readings are rows, so that no error adds up
-DRIFT = 0.02  # steps that a rounded step may be off at the end of the record
-WINDOW = 100  # stamps of a phase
-NEAR = 0.45  # steps between a stamp and its row
-REGULAR = 0.98  # share of the stamps that are near their row, each alone in it
+ROUNDED_STEP_DRIFT = 0.02  # steps that a rounded step may be off at the end of the record
+PHASE_STAMPS = 100  # stamps of a phase
+NEAR_ROW = 0.45  # steps between a stamp and its row
+REGULAR_STAMPS = 0.98  # share of the stamps that are near their row, each alone in it
 
 
 def exact_step(time_s: Array) -> float | None:
@@ -34,29 +34,29 @@ def exact_step(time_s: Array) -> float | None:
         h = sum (n - mean n) (t - mean t) / sum (n - mean n)^2,    n = round(t / h - phase)
 
     Lost readings and jitter of less than half a step do no harm; windows grow as long as they keep one phase. The
-    result is the shortest decimal number that is off by less than DRIFT of a step, and its own uncertainty, at the end
-    of the record.
+    result is the shortest decimal number that is off by less than ROUNDED_STEP_DRIFT of a step, and its own
+    uncertainty, at the end of the record.
     """
     step = np.diff(time_s)
     step = step[step > 0]
     if len(step) < 2:
         return float(step[0]) if len(step) else None
     h = float(np.median(step))
-    short = step[step < GAP * h]
+    short = step[step < STAMP_GAP * h]
     counted = float(np.round(short / h).sum())
     h = float(short.sum()) / counted if counted else h
     stamps = time_s[np.r_[True, np.diff(time_s) > 0]]
-    length, off, coherence = min(FIRST, len(stamps)), np.inf, 0.0
+    length, off, coherence = min(FIRST_STAMPS, len(stamps)), np.inf, 0.0
     while length <= len(stamps):
         whole = len(stamps) // length
         t = stamps[: whole * length].reshape(whole, length)
-        t = t[np.max(np.diff(t, axis=1), axis=1, initial=0.0) < GAP * h]
+        t = t[np.max(np.diff(t, axis=1), axis=1, initial=0.0) < STAMP_GAP * h]
         if not len(t):
             break
         t = t - t[:, :1]
         mean = np.exp(2j * np.pi * (t / h)).mean(axis=1)
         now = float(np.median(np.abs(mean)))
-        if now < max(COHERENT, WANDERS * coherence):
+        if now < max(CLOCK_COHERENCE, CLOCK_WANDERS * coherence):
             break
         number = np.round(t / h - np.angle(mean)[:, None] / (2 * np.pi))
         number -= number.mean(axis=1, keepdims=True)
@@ -68,9 +68,9 @@ def exact_step(time_s: Array) -> float | None:
         h = float(np.median(np.einsum("ij,ij->i", number, t) / square))
         left = float(np.sqrt(np.mean((t - h * number) ** 2))) / h
         # Seven standard deviations of the slope, over the length of the window.
-        off = (DRIFT + 7.0 * np.sqrt(12.0 / length) * left) / length
+        off = (ROUNDED_STEP_DRIFT + 7.0 * np.sqrt(12.0 / length) * left) / length
         coherence = now
-        length = length * WIDER if length * WIDER <= len(stamps) or length == len(stamps) else len(stamps)
+        length = length * WIDER_STAMPS if length * WIDER_STAMPS <= len(stamps) or length == len(stamps) else len(stamps)
     return _shortest(h, off) if coherence else None
 
 
@@ -90,19 +90,19 @@ def row_numbers(time_s: Array, step_s: float) -> NDArray[np.int64] | None:
     number = np.round(at)
     if np.abs(at - number).max() > 0.25:
         number = np.round(at - _phases(at))
-        if np.mean(np.abs(at - _phases(at) - number) <= NEAR) < REGULAR:
+        if np.mean(np.abs(at - _phases(at) - number) <= NEAR_ROW) < REGULAR_STAMPS:
             return None
     row = number.astype(np.int64)
     row -= row[0]
     apart = np.diff(row)
-    if apart.size and np.mean(apart > 0) < REGULAR:
+    if apart.size and np.mean(apart > 0) < REGULAR_STAMPS:
         return None
     return row
 
 
 def _phases(at: Array) -> Array:
     """The phase (n,) of stamps (n,) in steps, drawn between the middles of windows."""
-    starts = np.arange(0, len(at), WINDOW)
+    starts = np.arange(0, len(at), PHASE_STAMPS)
     count = np.diff(np.r_[starts, len(at)])
     turn = np.exp(2j * np.pi * at)
     phase = np.unwrap(np.angle(np.add.reduceat(turn, starts))) / (2 * np.pi)
@@ -130,9 +130,10 @@ NICE_S = (
 )
 HOLD_PERIODS = 3.2  # periods for which a reading holds: three, and a little for jitter
 IRREGULAR = 2.5  # 90 % over 10 % quantile of the steps, above which a tag reports by exception
-EDGE = 0.35  # smallest moves over the median one, of a tag with a dead band
-RESTED, LONGEST, ON_TIME, FEWEST = 2.0, 0.999, 0.02, 15  # of the shortest step; of the longest; share of such; moves
-FAR, TO_AND_FRO = 5.0, 0.6  # scans between two steps, and share of the moves that go back
+DEAD_BAND_EDGE = 0.35  # smallest moves over the median one, of a tag with a dead band
+# of the shortest step; of the longest; share of such; moves
+RESTED_STEPS, FULL_STEP, ON_TIME_SHARE, FEWEST_RESTED_MOVES = 2.0, 0.999, 0.02, 15
+FAR_APART_SCANS, TO_AND_FRO = 5.0, 0.6  # scans between two steps, and share of the moves that go back
 ROWS_A_LINE, MOST_ROWS_A_LINE = 4, 16  # rows on the median line of a PV that is drawn, and on the mean one
 FINEST = 1e-3  # of the median step: an archive's scan
 
@@ -176,19 +177,19 @@ def _is_held(step: Array, values: Array) -> bool:
     and fro, stored long after one another with nothing in between, are steps: a line has no such corners.
     """
     move = np.diff(values)
-    usual = step < LONGEST * step.max()
+    usual = step < FULL_STEP * step.max()
     # Where many steps are the longest one, the archive stored because of the time.
-    rested = (move != 0) & (step >= RESTED * step.min()) & (usual | (usual.mean() > 1 - ON_TIME))
-    if np.count_nonzero(rested) < FEWEST:
+    rested = (move != 0) & (step >= RESTED_STEPS * step.min()) & (usual | (usual.mean() > 1 - ON_TIME_SHARE))
+    if np.count_nonzero(rested) < FEWEST_RESTED_MOVES:
         rested = move != 0
     if not rested.any():
         return True
     low, middle = np.quantile(np.abs(move[rested]), [0.05, 0.5])
-    if low > EDGE * middle:
+    if low > DEAD_BAND_EDGE * middle:
         return True
     scan = quantum(step)
     back = move[1:] * move[:-1] < 0
-    return bool(scan > 0 and np.quantile(step, 0.05) >= FAR * scan and back.mean() > TO_AND_FRO)
+    return bool(scan > 0 and np.quantile(step, 0.05) >= FAR_APART_SCANS * scan and back.mean() > TO_AND_FRO)
 
 
 def proposed_period(series: Sequence[Series], others: Sequence[Series] = ()) -> float:

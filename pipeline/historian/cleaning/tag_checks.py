@@ -25,8 +25,8 @@ Where = NDArray[np.bool_]
 
 # values that systems write for a reading that they lack
 CODES = (-9999.0, 9999.0, -999.0, -999.25, -99999.0, 99999.0, -999999.0, 32767.0, -32768.0, 65535.0, 2147483647.0)
-AWAY = 0.25  # spans of the usual values between them and zero, from which zero is a dead sensor
-FAR = 2.0  # spans of the usual values between them and a code
+ZERO_DISTANCE_SPANS = 0.25  # spans of the usual values between them and zero, from which zero is a dead sensor
+CODE_DISTANCE_SPANS = 2.0  # spans of the usual values between them and a code
 REPEATED, REPEATED_SHARE = 3, 2e-4  # readings of one value far outside, from which it is a code
 MAINLY = 0.3  # of all values that far
 ABRUPT = 1.5  # of the largest other changes from reading to reading: a change to zero that no plant makes
@@ -37,13 +37,13 @@ VALVE_RANGE = (0.0, 100.0)  # where a manipulated variable in % can stand, if no
 def sentinels(values: Array, tag: Tag) -> tuple[Where, Counter[str]]:
     """Where (n,) codes for a missing value stand, and how often each.
 
-    A code is one of CODES, zero, or a value that comes again exactly, farther from the usual ones than FAR of their
-    spans. A value that an actuator can take is none: a manipulated variable may be zero, and often at an end of its
-    range.
+    A code is one of CODES, zero, or a value that comes again exactly, farther from the usual ones than
+    CODE_DISTANCE_SPANS of their spans. A value that an actuator can take is none: a manipulated variable may be zero,
+    and often at an end of its range.
     """
     low, high = core(values[values != 0.0])  # zeros of a dead sensor must not widen it
     span = max(high - low, 1e-6 * max(abs(low), abs(high), 1e-9))
-    out = (values < low - FAR * span) | (values > high + FAR * span)
+    out = (values < low - CODE_DISTANCE_SPANS * span) | (values > high + CODE_DISTANCE_SPANS * span)
     found: Counter[str] = Counter()
     zero = values == 0.0
     where = zero & (tag.role == "pv" and apart_zeros(values) > 0 and _dead(values, tag))
@@ -65,7 +65,7 @@ def apart_zeros(values: Array) -> int:
     zero = values == 0.0
     low, high = core(values[~zero])
     away = max(low, -high)  # from zero
-    if away <= AWAY * max(high - low, 1e-6 * max(abs(low), abs(high), 1e-9)):
+    if away <= ZERO_DISTANCE_SPANS * max(high - low, 1e-6 * max(abs(low), abs(high), 1e-9)):
         return 0
     n = int(np.count_nonzero(zero))
     between = np.count_nonzero((np.abs(values) < 0.5 * away) & ~zero & np.isfinite(values))
@@ -107,7 +107,7 @@ ONE_SIDED = "one_sided"  # kind of a finding
 FEW_TEXTS, MANY_TEXTS = 3, 0.01  # texts, and their share of the readings
 LEAST_READINGS, FEW_NEIGHBOURS = 50, 8  # readings of the tag, and beside its texts, below which nothing is concluded
 ONE_SIDE, END_SHARE = 0.9, 0.25  # of the texts, or of the readings beside them, at one end; the share that is an end
-MOSTLY = 0.5  # of the readings outside the given range: then the range or its unit is wrong
+MOSTLY_OUT_OF_RANGE = 0.5  # of the readings outside the given range: then the range or its unit is wrong
 
 
 def flag_bad_readings(series: Series, tag: Tag) -> list[Finding]:
@@ -200,7 +200,7 @@ def _out_of_range(series: Series, tag: Tag) -> list[Finding]:
         outside = (series.value < low - slack) | (series.value > high + slack)
     good = int(series.good.sum())
     n = series.flag(outside, Reason.RANGE)
-    if n > MOSTLY * good:
+    if n > MOSTLY_OUT_OF_RANGE * good:
         example = series.value[np.flatnonzero(outside)[0]]
         raise RecordError(
             f"{tag.tag}: {n} of {good} good readings, such as {example:.6g}, are outside its range {low:g} to {high:g} "

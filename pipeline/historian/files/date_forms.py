@@ -41,8 +41,8 @@ LONGEST = 30 * YEAR  # of a record
 SHORTEST_STEP = 2e-3  # shorter steps are of days: no plant is sampled every 2 ms, and many every 3 minutes
 USUAL_S = (*(60.0 * n for n in (3, 4, 5, 6, 10, 12, 15, 20, 30)), *(3600.0 * n for n in (1, 2, 3, 4, 6, 8, 12, 24)))
 GRIDS_S = (1.0, 60.0, 300.0, 600.0, 900.0, 1800.0, 3600.0, 7200.0)  # that dates of a plant's readings stand on
-REGULAR = 0.9  # of the steps are equal
-DIFFERENT = 10  # times of the day, for a grid that is no chance
+EQUAL_STEPS = 0.9  # of the steps are equal
+DISTINCT_TIMES = 10  # times of the day, for a grid that is no chance
 SHORT_DIGITS = 4  # a sampling period in seconds has no more
 
 
@@ -64,7 +64,7 @@ def days_of(values: Array, *, dated: bool, counter: bool = False, everywhere: bo
     if years.min() < FIRST_YEAR or years.max() > LAST_YEAR or np.ptp(values) > LONGEST:
         return None
     steps = np.abs(np.diff(values))
-    stands = np.count_nonzero(steps == 0) > (1 - REGULAR) * len(steps)  # digits are missing
+    stands = np.count_nonzero(steps == 0) > (1 - EQUAL_STEPS) * len(steps)  # digits are missing
     steps = steps[steps > 0]
     step, whole = (float(np.median(steps)) if steps.size else 0.0), not np.any(values % 1)
     if everywhere:
@@ -93,7 +93,7 @@ def _last_digit(values: Array) -> float:
 def _is_regular_and_odd(steps: Array, step: float, unit: float) -> bool:
     """Whether the steps are equal, and of no period that readings of a plant come in, taken as days."""
     equal = steps[np.abs(steps - step) <= 1.01 * unit]
-    if len(equal) < REGULAR * len(steps):
+    if len(equal) < EQUAL_STEPS * len(steps):
         return False
     period_s = DAY_S * float(np.mean(equal))
     error_s = DAY_S * unit * (1 + len(steps) - len(equal)) / len(equal) + 1e-6 * period_s
@@ -102,7 +102,7 @@ def _is_regular_and_odd(steps: Array, step: float, unit: float) -> bool:
 
 def _on_grid(values: Array, unit: float) -> bool:
     """Whether all numbers are whole seconds, minutes or hours of the day, as no numbers of few digits are."""
-    if len(np.unique(np.round(values % 1, 9))) < DIFFERENT:
+    if len(np.unique(np.round(values % 1, 9))) < DISTINCT_TIMES:
         return False
     short = np.abs(values * 10.0**SHORT_DIGITS - np.round(values * 10.0**SHORT_DIGITS)) < 1e-4
     for grid_s in GRIDS_S:

@@ -75,7 +75,7 @@ def _repeated(t: Array, keys: NDArray[np.uint64]) -> NDArray[np.bool_]:
 
 
 # ------------------------------------------------------------------------------------- series that grow block by block
-GROWTH = 1.1  # of an array that is full: what is spare takes memory too
+ARRAY_GROWTH = 1.1  # of an array that is full: what is spare takes memory too
 
 
 class Gathered:
@@ -170,7 +170,7 @@ class Growing:
         """Add the values of ``block`` (m,)."""
         end = self.length + len(block)
         if end > len(self.values):
-            self.values.resize(max(end, int(GROWTH * end)), refcheck=False)
+            self.values.resize(max(end, int(ARRAY_GROWTH * end)), refcheck=False)
         self.values[self.length : end] = block
         self.length = end
 

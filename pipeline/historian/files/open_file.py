@@ -35,7 +35,7 @@ from loopwright.pipeline.historian.files.quality import MOST_QUALITIES
 from loopwright.pipeline.historian.files.table_head import Head, head_of_table
 
 # ------------------------------------------------------------- the table of a workbook: the first sheet that holds one
-BLOCK = 1 << 15  # rows
+WORKBOOK_BLOCK = 1 << 15  # rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Sheet:
                     continue
                 for own, j in zip(cells, place, strict=True):
                     own.append(row[j] if j < len(row) else None)
-                if cells and len(cells[0]) == BLOCK:
+                if cells and len(cells[0]) == WORKBOOK_BLOCK:
                     yield pa.record_batch([column_of(c) for c in cells], names=list(columns))
                     cells = [[] for _ in place]
             if cells and cells[0]:
@@ -144,7 +144,7 @@ def _opened(path: Path) -> Iterator[Any]:
 # ------------------------------------------------------------------------------------------------------------ any file
 BLOCK_BYTES = 1 << 24
 BLOCK_ROWS = 1 << 17  # rows that are read at once
-SPREAD = 1_000  # cells of a block
+SPREAD_CELLS = 1_000  # cells of a block
 PARQUET = {".parquet", ".pq"}
 
 
@@ -191,7 +191,7 @@ class Opened:
         cells = list[Any]()
         for block in self.blocks([column]):
             own = block.column(0)
-            cells += own.take(pa.array(range(0, len(own), max(1, len(own) // SPREAD)))).to_pylist()
+            cells += own.take(pa.array(range(0, len(own), max(1, len(own) // SPREAD_CELLS)))).to_pylist()
         self.unreadable.clear()
         return cells
 
@@ -220,7 +220,7 @@ class Opened:
 
         def blocks(names: Sequence[str]) -> Iterator[Mapping[str, list[str]]]:
             for block in self.blocks(names):
-                some = pa.array(range(0, len(block), max(1, len(block) // SPREAD)))
+                some = pa.array(range(0, len(block), max(1, len(block) // SPREAD_CELLS)))
                 yield {n: [text_of(c) for c in block.column(n).take(some).to_pylist()] for n in names}
 
         sign = whole_files_sign(self.sign, blocks, self.separator, str(self.path))

@@ -44,9 +44,10 @@ CLASSIC = {0, 4, 8, 12, 16, 20, 24, 28, 32, 64, 68, 80, 84, 88, 192, 216}
 UA_CODES = 1 << 30
 """OPC UA: bits 31 and 30 are 00 for good, 01 for uncertain, 10 for bad."""
 WHOLE_SHARE, WHOLE_HEX = 100, 8  # [%] of a quality that is good, and digits of a whole status code
-MOST = 0.75  # of the rows have what is good, where nothing but its number tells it; a state of the plant has less
+# of the rows have what is good, where nothing but its number tells it; a state of the plant has less
+MOSTLY_GOOD = 0.75
 MOST_QUALITIES = 1_000  # more are the values of a tag
-MOST_STATES = 20  # numbers of a column of states; more are readings
+MOST_STATE_NUMBERS = 20  # numbers of a column of states; more are readings
 UNUSED = "does not tell which of its values is good, and is not used"
 
 
@@ -105,7 +106,7 @@ def meaning_of(column: str, counts: Mapping[str, int]) -> Meaning:
         return Meaning(frozenset(others), f"{shown} is good, because no word for it stands beside {min(bad)}")
     if not bad and others and all(MARK.match(words[t]) for t in others):
         most = max(others, key=lambda t: counts[t])
-        if counts[most] >= MOST * sum(counts.values()):
+        if counts[most] >= MOSTLY_GOOD * sum(counts.values()):
             return Meaning(frozenset({most}), f"{most.strip() or 'an empty cell'} is good, as in most rows")
     return Meaning(frozenset()) if bad else Meaning(None, UNUSED)
 
@@ -120,14 +121,14 @@ def _of_figures(column: str, figures: Mapping[str, int], counts: Mapping[str, in
     whole = {t for t, v in values.items() if v == WHOLE_SHARE}
     if max(known) == WHOLE_SHARE and (known <= {0, WHOLE_SHARE} or 2 * _times(whole, counts) > total):
         return whole, "percent, of which 100 is good"
-    if classic and (_are_codes(known) or _times(classic, counts) >= MOST * total):
+    if classic and (_are_codes(known) or _times(classic, counts) >= MOSTLY_GOOD * total):
         return classic, ""
     if known <= {0, 1}:
         meaning = _flags(column, {t: v == 1 for t, v in values.items()}, counts, plain=True)
         return None if meaning.good is None else set(meaning.good), meaning.says
     most = max(values, key=lambda t: counts[t])
     same = {t for t, v in values.items() if v == values[most]}
-    if _times(same, counts) < MOST * total:
+    if _times(same, counts) < MOSTLY_GOOD * total:
         return None, UNUSED
     return same, f"{most} is good, as in most rows"
 
@@ -148,7 +149,7 @@ def _flags(column: str, truth: Mapping[str, bool], counts: Mapping[str, int], *,
     if (GOOD_BY_NAME if plain else POSITIVE).search(name):
         return Meaning(frozenset(true), _shown(true, "because of the column's name") if plain else "")
     most = true if _times(true, counts) > _times(false, counts) else false
-    if _times(most, counts) < MOST * (_times(true, counts) + _times(false, counts)):
+    if _times(most, counts) < MOSTLY_GOOD * (_times(true, counts) + _times(false, counts)):
         return Meaning(None, UNUSED)
     return Meaning(frozenset(most), _shown(most, "as in most rows"))
 
@@ -199,13 +200,13 @@ def is_quality(column: str, counts: Mapping[str, int], *, beside: bool) -> bool:
     values = {t: v & 0xFFFFFFFF for t, v in figures.items()}
     known, total = set(values.values()), sum(counts.values())
     usual = _times({t for t, v in values.items() if v in {192, 216}}, counts)
-    if (word != "q" and usual and usual >= MOST * total) or (
+    if (word != "q" and usual and usual >= MOSTLY_GOOD * total) or (
         _are_codes(known, bare=True) and any(v >= OPC_GOOD for v in known)
     ):
         return True
     if not beside:
         return is_sure(column) and known <= {0, 1, WHOLE_SHARE}
-    return word != "q" and len(known) <= MOST_STATES and meaning_of(column, counts).good is not None
+    return word != "q" and len(known) <= MOST_STATE_NUMBERS and meaning_of(column, counts).good is not None
 
 
 class Reason(IntEnum):

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.metrics import Array
 
-SAMPLE = 50_000  # readings that a column's character is taken from
+CHARACTER_READINGS = 50_000  # readings that a column's character is taken from
 STUCK_CHANCE = 1e-4  # of a stretch as long by chance anywhere in the record
 SHORTEST_STUCK, LONGEST_STUCK = 8, 400  # rows
 NOISY = 0.2  # share of equal neighbours, up to which a value that repeats is a fault whatever the others do
 ALTERNATING = 0.6  # share of the second differences that change their sign, from which they are noise
 SEEN_MOVE, SEEN_STEPS = 0.05, 3  # of its span that another signal moves, and steps of the converter that this must be
 CLIPPED_ROWS = 5  # rows in a row at an end of the readings, from which on it is a range's end
-HELD = 0.6  # share of rows without a move, from which a signal is moved in steps
+HELD_ROWS = 0.6  # share of rows without a move, from which a signal is moved in steps
 LINEAR_ROWS = 5  # of a stretch that a compressed signal's interpolation makes straight
 
 Where = NDArray[np.bool_]
@@ -28,7 +28,7 @@ def quantum(values: Array) -> float:
     The smallest difference q of two values, if at least 99 % of the distances between neighbouring values are whole
     multiples of it, to 5 %.
     """
-    sample = values[np.isfinite(values)][:SAMPLE]
+    sample = values[np.isfinite(values)][:CHARACTER_READINGS]
     levels = np.unique(sample)
     if len(levels) < 2:
         return 0.0
@@ -45,7 +45,7 @@ def quantum(values: Array) -> float:
 
 def smallest_difference(values: Array) -> float:
     """The smallest difference of two of the values (n,); 0 where all are one."""
-    levels = np.unique(values[np.isfinite(values)][:SAMPLE])
+    levels = np.unique(values[np.isfinite(values)][:CHARACTER_READINGS])
     apart = np.diff(levels)
     apart = apart[apart > 1e-9 * float(np.abs(levels).max(initial=1e-300))]
     return float(f"{apart.min():.6g}") if apart.size else 0.0
@@ -56,7 +56,7 @@ def noisy(values: Array) -> bool:
 
     In white noise 73 % of them do; a smooth curve's keep it, and those of a coarse converter are its steps.
     """
-    v = values[np.isfinite(values)][:SAMPLE]
+    v = values[np.isfinite(values)][:CHARACTER_READINGS]
     second = np.diff(v, 2)
     if not second.size:
         return False
@@ -119,7 +119,7 @@ def clipped(values: Array, low: float | None, high: float | None) -> tuple[Where
     if finite.size < 10 * CLIPPED_ROWS or np.ptp(finite) == 0:
         return where, ()
     span = float(np.ptp(finite))
-    held = held_share(values) >= HELD
+    held = held_share(values) >= HELD_ROWS
     for end, given, sign in ((float(finite.max()), high, 1), (float(finite.min()), low, -1)):
         at = np.abs(values - end) <= 1e-9 * span
         start, stop = runs_of(at)
@@ -144,7 +144,7 @@ def straight_share(values: Array) -> float:
 
     Interpolation of a compressed signal (swinging door) leaves them; noise and smooth curves have next to none.
     """
-    v = values[np.isfinite(values)][:SAMPLE]
+    v = values[np.isfinite(values)][:CHARACTER_READINGS]
     if len(v) < 50:
         return 0.0
     digits = _digits(v)
@@ -173,7 +173,7 @@ def staircase(values: Array) -> int:
 
     At least 95 % of the distances between two changes are multiples of it.
     """
-    v = values[np.isfinite(values)][:SAMPLE]
+    v = values[np.isfinite(values)][:CHARACTER_READINGS]
     change = np.flatnonzero(np.diff(v) != 0) + 1
     if len(change) < 30:
         return 1

@@ -13,9 +13,9 @@ from loopwright.pipeline.historian.files.numbers import NUMBER, plain
 
 ISO_DAY = re.compile(r"^\d{4}-\d\d-\d\d([T ].*)?$")
 LONGEST_UNIT = 14  # characters
-MOSTLY = 0.6  # of the lines have as many cells
+ALIKE_LINES = 0.6  # of the lines have as many cells
 UNIT_WORDS = {"", "unit", "units", "einheit", "einheiten", "eu", "engunits", "uom", "unité", "unidad"}
-LARGEST = 40  # characters of a number or time
+LONGEST_CELL = 40  # characters of a number or time
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ def kind_of_cell(cell: str) -> str:
     """The kind of a cell: "empty", "number", "time" or "text"."""
     if not cell:
         return "empty"
-    if len(cell) > LARGEST:
+    if len(cell) > LONGEST_CELL:
         return "text"
     if NUMBER.match(cell):
         return "number"
@@ -49,7 +49,7 @@ def head_of_table(lines: Sequence[Sequence[str]]) -> Head | str:
     if not lengths:
         return ""
     width, times = lengths.most_common(1)[0]
-    if times < MOSTLY * sum(1 for c in lines if any(c)):
+    if times < ALIKE_LINES * sum(1 for c in lines if any(c)):
         return ""
     ends_empty = not any(c[-1] for c in lines if len(c) == width)
     rows = [_of_width(c, width, ends_empty) for c in lines]

@@ -17,8 +17,8 @@ from loopwright.pipeline.historian.files.table_head import kind_of_cell
 from loopwright.pipeline.historian.files.time_stamps import SINCE_1970_S, TimeForm, clock_of, given_clock
 from loopwright.pipeline.metrics import Array
 
-SAMPLE = 200  # cells of a column
-RISES = 0.9  # share of the steps that go one way
+TIME_CELLS = 200  # cells of a column
+RISING_STEPS = 0.9  # share of the steps that go one way
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def time_column_of(
     found, refused = list[TimeCandidate](), list[tuple[int, RecordError]]()
     for column in header:
         try:
-            candidate = _candidate(path, column, sample.get(column, ())[:SAMPLE], units.get(column, ""), spread)
+            candidate = _candidate(path, column, sample.get(column, ())[:TIME_CELLS], units.get(column, ""), spread)
         except RecordError as error:
             refused.append((time_header(column).rank, error))
             continue
@@ -137,7 +137,7 @@ def _way(seconds: Array) -> tuple[bool, bool]:
     """Whether times (n,) rise or fall, and whether they stand."""
     steps = np.diff(seconds[np.isfinite(seconds)])
     way = max(np.count_nonzero(steps > 0), np.count_nonzero(steps < 0))
-    rises = bool(way >= RISES * np.count_nonzero(steps)) if len(steps) else True
+    rises = bool(way >= RISING_STEPS * np.count_nonzero(steps)) if len(steps) else True
     return rises, bool(len(steps)) and not steps.any()
 
 
@@ -168,7 +168,7 @@ def _named(
         return TimeColumn(pair[1], given, pair[:1]) if pair and given.dates else TimeColumn(column, given)
     if pair:
         return _paired(path, sample, *pair, spread)
-    where, cells = f"{path}: column {column!r}", sample.get(column, ())[:SAMPLE]
+    where, cells = f"{path}: column {column!r}", sample.get(column, ())[:TIME_CELLS]
     unit = split_header(column)[1] or units.get(column, "")
     name = column if time_header(column).named else f"time [{unit}]" if unit else "time"
     clock = _clock_by_all(name, cells, where, unit, lambda: spread(column))
@@ -185,7 +185,7 @@ def _fitting(path: Path, header: Sequence[str], sample: Mapping[str, Sequence[An
     """The column that a given form reads: most cells, and the best name."""
     found = []
     for column in header:
-        cells = [c for c in sample.get(column, ())[:SAMPLE] if c is not None and str(c).strip()]
+        cells = [c for c in sample.get(column, ())[:TIME_CELLS] if c is not None and str(c).strip()]
         rank = time_header(column).rank
         if cells and (clock.dates or rank < 3 or len(header) == 1):
             found.append((rank, -float(np.mean(np.isfinite(seconds_of(clock, cells)))), column))
@@ -244,7 +244,7 @@ def _may_be_hours(column: str) -> bool:
 def _quiet(column: str, cells: Sequence[str]) -> TimeForm | None:
     """The clock of a column of days; one whose day and month cannot be told apart is a column of days too."""
     try:
-        return clock_of(column, cells[:SAMPLE], column)
+        return clock_of(column, cells[:TIME_CELLS], column)
     except RecordError:
         return TimeForm("iso")
 
@@ -276,7 +276,7 @@ def _paired(
     def more() -> list[str]:
         return [f"{day} {hours[0]}" for day in spread(date)]
 
-    clock = _clock_by_all("time", both[:SAMPLE], f"{path}: columns {date!r} and {time!r}", "", more)
+    clock = _clock_by_all("time", both[:TIME_CELLS], f"{path}: columns {date!r} and {time!r}", "", more)
     if clock is None:
         raise RecordError(
             f"{path}: {both[0]!r} of the columns {date!r} and {time!r} is no time that can be read; give its form "

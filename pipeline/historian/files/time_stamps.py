@@ -160,7 +160,7 @@ IN_UTC, UNSTATED = "UTC", "the export states no zone"
 
 
 # Ticks of 100 ns: of .NET since the year 1, of Windows since 1601.
-TICKS = ((6.2e17, 6.6e17, 62_135_596_800.0), (1.25e17, 1.45e17, 11_644_473_600.0))
+TICK_COUNTS = ((6.2e17, 6.6e17, 62_135_596_800.0), (1.25e17, 1.45e17, 11_644_473_600.0))
 STARTS = {d.at_1970 * DAY_S for d in DAYS}
 SERIAL_UNIT = "serial"
 
@@ -293,7 +293,7 @@ def _numeric(header: TimeHeader, values: Array, where: str, unit: str, *, everyw
         return TimeForm("number", factor)
     if factor is None and (form := calendar_digits(values.tolist(), days=header.date)):
         return TimeForm("format", format=form)
-    for low, high, start_s in TICKS:
+    for low, high, start_s in TICK_COUNTS:
         if low < size < high:
             return TimeForm("number", 1e-7, start_s, says="numbers are ticks of 100 ns")
     # Seconds since 1970 have ten digits, milliseconds thirteen.

@@ -20,7 +20,7 @@ from loopwright.pipeline.laws.base import (
     require_part,
     require_single_loop,
 )
-from loopwright.pipeline.laws.inverse.from_identified import LONGEST, HorizonChoice, learnt_parts
+from loopwright.pipeline.laws.inverse.from_identified import LONGEST_INVERSE_HORIZON, HorizonChoice, learnt_parts
 from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
@@ -39,7 +39,7 @@ def candidates(model: Model, x: Tensor, u: Tensor) -> Tensor:
 
 # ------------------------------------------------------------------------------------------------------------- the law
 # Share of the MV's range within which the plant's MV counts as the law's own: readings are rounded.
-FOLLOWED = 1e-3
+OWN_MV_BAND = 1e-3
 OWN_CHOICE = ("identified",)  # parts of a set from which a law chooses and learns its networks itself
 ONE_PERIOD = "a network of task forward over one period, its target the observed PV"
 
@@ -113,8 +113,10 @@ class ObserverLaw(ControlLaw):
                 raise ValueError(
                     f"integral_gain is {self.integral_gain} and band {self.band}; they must be >= 0 and > 0"
                 )
-            if self.horizon is not None and not 1 <= self.horizon <= LONGEST:
-                raise ValueError(f"horizon is {self.horizon}; give 1 to {LONGEST} periods, or leave it out")
+            if self.horizon is not None and not 1 <= self.horizon <= LONGEST_INVERSE_HORIZON:
+                raise ValueError(
+                    f"horizon is {self.horizon}; give 1 to {LONGEST_INVERSE_HORIZON} periods, or leave it out"
+                )
 
     observes_within: ClassVar[int | None] = 1
     choice: HorizonChoice | None = None
@@ -201,7 +203,7 @@ class ObserverLaw(ControlLaw):
         mv = self.limited(requested, mv_applied)
         # Acting on an error that someone else's MV leaves would be winding up, in manual as at a limit.
         error = sp - pv[..., :1]
-        acts = torch.cat([error / params.band, (mv_applied - mv1) / (FOLLOWED * self.span)], dim=-1)
+        acts = torch.cat([error / params.band, (mv_applied - mv1) / (OWN_MV_BAND * self.span)], dim=-1)
         free = (mv == requested) & (acts.abs().amax(dim=-1, keepdim=True) < 1)
         # The integral takes what the observer leaves: no more than the band in which it acts.
         moved = integral + params.integral_gain * error

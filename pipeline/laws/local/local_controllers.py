@@ -22,8 +22,8 @@ from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
 from loopwright.pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
 
-BATCH = 500  # loops that run side by side in one piece
-SAME = 1e-3  # relative difference of two states that count as one
+LOCAL_BATCH = 500  # loops that run side by side in one piece
+SAME_STATE = 1e-3  # relative difference of two states that count as one
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ def _recoveries(law: ControlLaw, plant: EquationPlant, edges: Array, test: Stabi
 
     run = partial(recover, plant, law, law.n_state, samples=test.samples, band=band, holding=test.holding)
     # The first batch has all whose courses are kept.
-    batches = starts.batches(max(BATCH, test.watched))
+    batches = starts.batches(max(LOCAL_BATCH, test.watched))
     work = [(batch, test.watched if i == 0 else 0) for i, batch in enumerate(batches)]
     ended = Recovery.together(parallel_map(partial(_batch, run), work, f"{law.name}: loops from many starts"))
     minutes = plant.period_s / 60.0
@@ -161,7 +161,7 @@ def _recoveries(law: ControlLaw, plant: EquationPlant, edges: Array, test: Stabi
     cv = plant.measured(back.end)[:, 0]
     # What swings within the range does not arrive either, and yet came back.
     for state in back.end[~back.arrived & ((cv < sp.low) | (cv > sp.high))]:
-        if all(np.abs(state / known - 1).max() > SAME for known in kept):
+        if all(np.abs(state / known - 1).max() > SAME_STATE for known in kept):
             kept.append(state)
     figures["states_of_no_return"] = float(len(kept))
     names = ", ".join(s.name for s in plant.state_signals)

@@ -22,9 +22,10 @@ from loopwright.pipeline.tuning.reduction import LagWithDeadTime, start_lags
 from loopwright.pipeline.tuning.responses import StepResponses
 from loopwright.pipeline.tuning.rules import AllPole, PidSettings
 
-HOLD = 100  # samples of a development set point
-TIMES, CROSSINGS = 2, 3  # where it lasts so many times as long as the plant takes to settle, or to cross its range
-HOLDS = (60, 400)  # least and most
+DEVELOPMENT_HOLD = 100  # samples of a development set point
+# where it lasts so many times as long as the plant takes to settle, or to cross its range
+HOLD_SETTLING_TIMES, HOLD_RANGE_CROSSINGS = 2, 3
+DEVELOPMENT_HOLDS = (60, 400)  # least and most
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +83,10 @@ def tuned(
     elif p.tuning == "optimized":
         if plant is None:
             raise LawError("PID tuning `optimized` needs a simulator; take manual, imc, simc or itae")
-        known, hold = equations(plant, "PID tuning `optimized` on a linearized plant"), p.development_hold or HOLD
+        known, hold = (
+            equations(plant, "PID tuning `optimized` on a linearized plant"),
+            p.development_hold or DEVELOPMENT_HOLD,
+        )
         loops = DevelopmentLoops.draw(known, p.development_seeds, p.development_set_points, hold)
         free = p.set_point_weight is None
 
@@ -126,8 +130,8 @@ def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) ->
     """The cheapest numbers in closed loop over the plant and its variations, of the given or the best two pairings."""
     responses = StepResponses.near_start(plant)
     low, high = plant.asked
-    longest = max(TIMES * responses.settling, CROSSINGS * responses.crossing(high - low))
-    hold = params.development_hold or int(np.clip(longest, *HOLDS))
+    longest = max(HOLD_SETTLING_TIMES * responses.settling, HOLD_RANGE_CROSSINGS * responses.crossing(high - low))
+    hold = params.development_hold or int(np.clip(longest, *DEVELOPMENT_HOLDS))
     drawn = (params.development_seeds, params.development_set_points, hold)
     plants = [DevelopmentLoops.by_simulation(variation, *drawn) for variation in plant.variations()]
     percent = 100 / (signals.sp[0].high - signals.sp[0].low)

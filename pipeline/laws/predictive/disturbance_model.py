@@ -11,13 +11,13 @@ from torch import Tensor
 from loopwright.pipeline.models.identified.identified import Identified
 
 Where: TypeAlias = Literal["mvs", "outputs"]
-GROWTH = 1 / 3  # scaled, a sample: largest growth of the outputs under a unit load at an MV
-LARGEST = 20.0  # scaled MV a scaled load: an MV that hardly moves anything has no larger load
-SHOWN = 0.05  # share of the effect after a horizon from which on a load is seen
-LATER = (0, 2)  # samples after that at which a filter of innovations is sure of it
-SETTLE = 300  # samples to come to rest
-AWAY = 8.0  # scaled: a state this far off has run away
-NEWTON = 10  # steps to the rest at the record's means
+LOAD_GROWTH = 1 / 3  # scaled, a sample: largest growth of the outputs under a unit load at an MV
+LARGEST_LOAD = 20.0  # scaled MV a scaled load: an MV that hardly moves anything has no larger load
+LOAD_SHOWN = 0.05  # share of the effect after a horizon from which on a load is seen
+LOAD_SURE_LATER = (0, 2)  # samples after that at which a filter of innovations is sure of it
+REST_SAMPLES = 300  # samples to come to rest
+RUNAWAY_STATE = 8.0  # scaled: a state this far off has run away
+MEAN_REST_STEPS = 10  # steps to the rest at the record's means
 LEAST_SHOWN = 1e-3  # scaled, a sample: of a load that moves the states by less a rest says nothing
 
 
@@ -60,11 +60,11 @@ def loads_of(model: Identified, where: Where, horizon: int) -> Loads:
     by_mv = answers(a, b[:, :n_mv], horizon)  # (N, n_x, n_mv)
     y = by_mv[:, :n_y]
     size, growth = y.norm(dim=1), torch.diff(y, dim=0, prepend=0 * y[:1]).norm(dim=1)  # (N, n_mv)
-    scale = GROWTH / torch.clamp(growth.amax(dim=0), min=GROWTH / LARGEST)
+    scale = LOAD_GROWTH / torch.clamp(growth.amax(dim=0), min=LOAD_GROWTH / LARGEST_LOAD)
     into_v = torch.zeros(model.n_v, n_mv, dtype=torch.float64)
     into_v[:n_mv] = torch.diag(scale)
-    shown = torch.where(size > SHOWN * size[-1], 1.0, 0.0).argmax(dim=0)  # (n_mv,)
-    ages = torch.clamp(torch.stack([shown + later for later in LATER]), max=horizon - 1)  # (L, n_mv)
+    shown = torch.where(size > LOAD_SHOWN * size[-1], 1.0, 0.0).argmax(dim=0)  # (n_mv,)
+    ages = torch.clamp(torch.stack([shown + later for later in LOAD_SURE_LATER]), max=horizon - 1)  # (L, n_mv)
     begun = torch.stack([by_mv[ages[:, i], :, i] * scale[i] for i in range(n_mv)], dim=-1)
     share = y[-1].square() / torch.clamp(size[-1].square(), min=1e-12)
     return Loads(torch.zeros(n_x, n_mv, dtype=torch.float64), into_v, share, begun)
@@ -84,7 +84,7 @@ def held_rest(model: Identified, loads: Loads) -> Tensor:
     n_d, none = loads.count, torch.zeros(n_y, 1, dtype=torch.float64)
     z = best = torch.cat([model.at_rest(model.y_center, model.v_center), torch.zeros(n_d, dtype=torch.float64)])
     least = torch.inf
-    for _ in range(NEWTON):
+    for _ in range(MEAN_REST_STEPS):
         x, d = z[:n_x], z[n_x:]
         v = model.v_center + model.v_scale * (loads.into_v @ d)
         left = model(torch.cat([x, v])) + loads.into_x @ d - x
@@ -146,9 +146,9 @@ def slopes_at_rest(model: Identified) -> tuple[Tensor, Tensor]:
     Where that runs away, as a level does, at the rest with the record's mean outputs.
     """
     x = start = model.at_rest(model.y_center, model.v_center)
-    for _ in range(SETTLE):
+    for _ in range(REST_SAMPLES):
         x = model(torch.cat([x, model.v_center]))
-    x = x if bool((x.abs() < AWAY).all()) else start
+    x = x if bool((x.abs() < RUNAWAY_STATE).all()) else start
     return _slopes(model, x, torch.zeros(model.n_v, dtype=torch.float64))
 
 

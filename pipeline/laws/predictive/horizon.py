@@ -124,7 +124,7 @@ def one_step(model: Identified, loads: Loads, p: Named) -> dict[str, Tensor]:
 # ---------------------------------------------------------------------------------------------- the run over a horizon
 Scaling = Callable[[Tensor], Tensor]
 """The scaled MVs (..., n_mv) of a model for MVs (..., n_mv) within -1..1."""
-SMALL = 1e-6  # tanh(SMALL x)/SMALL is x to 3e-13 x^3
+SMALL_TANH = 1e-6  # tanh(SMALL_TANH x)/SMALL_TANH is x to 3e-13 x^3
 
 
 class Prediction(NamedTuple):
@@ -199,7 +199,8 @@ class NetworkHorizon(nn.Module):
             layout_of(model, loads, moves),
             lambda p: {f"p{i}": u for i, u in enumerate(_forced(model, loads, moves, mv_of, p))},
         )
-        w1_x, to_x = model.w1[:, :n_x], torch.cat([model.w2, model.a / SMALL], dim=1)  # from tanh(p) to the unforced x
+        # from tanh(p) to the unforced x
+        w1_x, to_x = model.w1[:, :n_x], torch.cat([model.w2, model.a / SMALL_TANH], dim=1)
         gain = mv_of(torch.eye(n_mv, dtype=torch.float64)) - mv_of(torch.zeros(n_mv, dtype=torch.float64))
         into = torch.cat([w1_x, model.w1[:, n_x : n_x + n_mv] @ gain.T], dim=1)  # (n_h, n_s)
         bends = into.unsqueeze(-1) * pad(model.w2.T, (0, n_mv)).unsqueeze(-2)  # (n_h, n_s, n_s)
@@ -208,7 +209,7 @@ class NetworkHorizon(nn.Module):
         # From the flat (m, N, n_s) slopes to those of the controlled outputs, in both orders.
         at = np.arange(m * n * self.n_s).reshape(m, n, self.n_s)[:, :, :n_cv].reshape(m, n * n_cv)
         buffers = {
-            "step": torch.cat([w1_x @ to_x, SMALL * to_x]).T,
+            "step": torch.cat([w1_x @ to_x, SMALL_TANH * to_x]).T,
             "bends": -bends.flatten(1),
             "straight": (linear + bends.sum(dim=0)).flatten(),
             "pushes": pad(pad(shares.reshape(n, m, n_mv), (n_x, 0)), (0, 0, 0, 0, 0, 1)),  # (N + 1, m, n_s)
@@ -217,7 +218,7 @@ class NetworkHorizon(nn.Module):
         }
         for name, matrix in buffers.items():
             self.register_buffer(name, matrix.contiguous())
-        hold_numbers(self, by_small=1 / SMALL)
+        hold_numbers(self, by_small=1 / SMALL_TANH)
 
     def forward(self, start: Tensor, plan: Tensor) -> Prediction:
         """The run from ``start`` (..., 1, n_x + n_d + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
@@ -272,6 +273,6 @@ def _forced(model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, p: Na
     for i in range(moves.horizon + 1):
         here = v[..., min(i, moves.horizon - 1), :]
         hidden = one_step(model, loads, {"x": x, "d": p["d"], "v": here})["hidden"]
-        found.append(torch.cat([hidden, SMALL * x], dim=-1))
+        found.append(torch.cat([hidden, SMALL_TANH * x], dim=-1))
         x = one_step(model, loads, {"x": torch.zeros_like(x), "d": p["d"], "v": here})["next"]
     return found

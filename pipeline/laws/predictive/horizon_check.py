@@ -14,16 +14,17 @@ from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Array
 
 # ------------------------------------------------------------------------------------------------------------ settling
-LEVELS = (-0.8, -0.4, 0.0, 0.4, 0.8)  # of an MV in its range -1..1, the others in the middle of theirs
-STEP = 0.3  # of an MV, up and down
-BEFORE, AFTER = 200, 150  # samples at each level, and after the step
-BAND = 0.1  # share of the whole answer within which it has settled
-LEAST_ANSWER = 0.02  # share of the largest answer of an output; smaller ones have no settling time
-STEADY = 0.9  # share of its slope before that an output keeps which never comes to rest
-TINY = 1e-12  # smallest slope that is divided by
-SHARE = 0.9  # of the steps that the horizon is long enough for
-SHORTEST, LONGEST = 12, 50  # [samples] of a horizon that is chosen here
-EXPLODED = 100.0  # scaled; a state this large that grows on fourfold in half of BEFORE comes from an unstable model
+MV_LEVELS = (-0.8, -0.4, 0.0, 0.4, 0.8)  # of an MV in its range -1..1, the others in the middle of theirs
+LEVEL_STEP = 0.3  # of an MV, up and down
+LEVEL_SAMPLES, STEP_SAMPLES = 200, 150  # samples at each level, and after the step
+SETTLED_BAND = 0.1  # share of the whole answer within which it has settled
+LEAST_OUTPUT_ANSWER = 0.02  # share of the largest answer of an output; smaller ones have no settling time
+UNSETTLED_SLOPE = 0.9  # share of its slope before that an output keeps which never comes to rest
+TINY_SLOPE = 1e-12  # smallest slope that is divided by
+COVERED_STEPS = 0.9  # of the steps that the horizon is long enough for
+SHORTEST_CHOSEN, LONGEST_CHOSEN = 12, 50  # [samples] of a horizon that is chosen here
+# scaled; a state this large that grows on fourfold in half of LEVEL_SAMPLES comes from an unstable model
+UNSTABLE_STATE = 100.0
 
 
 def mvs_of(model: Identified, middle: Tensor, half: Tensor) -> Callable[[Tensor], Tensor]:
@@ -39,51 +40,57 @@ def horizon_for(model: Identified, mv_of: Callable[[Tensor], Tensor]) -> int:
     ``mv_of`` gives the scaled MVs (..., n_mv) of the model for MVs within -1..1. LawError for an unstable model.
     """
     settling = settling_times(step_responses(model, mv_of))
-    wanted = np.quantile(settling, SHARE) if settling.size else SHORTEST
-    return int(np.clip(np.ceil(wanted), SHORTEST, LONGEST))
+    wanted = np.quantile(settling, COVERED_STEPS) if settling.size else SHORTEST_CHOSEN
+    return int(np.clip(np.ceil(wanted), SHORTEST_CHOSEN, LONGEST_CHOSEN))
 
 
 @torch.no_grad()
 def step_responses(model: Identified, mv_of: Callable[[Tensor], Tensor]) -> Array:
-    """Scaled outputs (runs, AFTER + 1, n_y) from the sample of a step on, of every MV at every level, both ways."""
+    """Scaled outputs (runs, STEP_SAMPLES + 1, n_y) from a step's sample on, of every MV at every level, both ways."""
     refuse_unstable(model)
-    steps = [(i, at, by) for i in range(model.n_mv) for at in LEVELS for by in (STEP, -STEP) if abs(at + by) <= 1]
+    steps = [
+        (i, at, by)
+        for i in range(model.n_mv)
+        for at in MV_LEVELS
+        for by in (LEVEL_STEP, -LEVEL_STEP)
+        if abs(at + by) <= 1
+    ]
     z = torch.zeros(len(steps), model.n_mv, dtype=torch.float64)
     moved = z.clone()
     for run, (i, at, by) in enumerate(steps):
         z[run, i], moved[run, i] = at, at + by
     x = torch.zeros(len(steps), model.n_x, dtype=torch.float64)
     halfway = x
-    for k in range(BEFORE):
-        x, halfway = advanced(model, x, mv_of(z)), x if k == BEFORE // 2 else halfway
+    for k in range(LEVEL_SAMPLES):
+        x, halfway = advanced(model, x, mv_of(z)), x if k == LEVEL_SAMPLES // 2 else halfway
     end, before = (float(t.abs().max()) for t in (x, halfway))
-    if not end < max(EXPLODED, 4 * before):
+    if not end < max(UNSTABLE_STATE, 4 * before):
         raise LawError(
             f"law 'predictive': the identified model is unstable, its states grow from {before:.3g} to {end:.3g} under "
             "constant MVs (they must settle, or grow evenly as a level does); identify it again with longer free runs"
         )
     y = [x[:, : model.n_y]]
-    for _ in range(AFTER):
+    for _ in range(STEP_SAMPLES):
         x = advanced(model, x, mv_of(moved))
         y.append(x[:, : model.n_y])
     return torch.stack(y, dim=1).numpy()
 
 
 def settling_times(responses: Array) -> Array:
-    """Samples (answers,) until each answer stays within BAND of its end, of responses (runs, n, n_y).
+    """Samples (answers,) until each answer stays within SETTLED_BAND of its end, of responses (runs, n, n_y).
 
     An output that a step hardly moves has no answer. One that goes on and on, as a level, settles twice as late as it
     first moves as fast as later on: so long it takes to set it moving, and to stop it.
     """
     change = responses[:, -1] - responses[:, 0]  # (runs, n_y)
-    away = np.abs(responses - responses[:, -1:]) > BAND * np.abs(change)[:, None]
+    away = np.abs(responses - responses[:, -1:]) > SETTLED_BAND * np.abs(change)[:, None]
     last = np.where(away, np.arange(responses.shape[1])[:, None], -1).max(axis=1) + 1
     slope = np.abs(np.diff(responses, axis=1))  # (runs, n - 1, n_y)
     begun, middle, end = (np.median(part, axis=1) for part in np.array_split(slope, 3, axis=1))
-    goes_on = np.median(end / np.maximum(middle, TINY), axis=0) > STEADY  # (n_y,)
-    moving = 2 * (slope >= (1 - BAND) * begun[:, None]).argmax(axis=1) + 2
+    goes_on = np.median(end / np.maximum(middle, TINY_SLOPE), axis=0) > UNSETTLED_SLOPE  # (n_y,)
+    moving = 2 * (slope >= (1 - SETTLED_BAND) * begun[:, None]).argmax(axis=1) + 2
     found = np.where(goes_on, moving, last)
-    return np.asarray(found[np.abs(change) > LEAST_ANSWER * np.abs(change).max(axis=0)], dtype=np.float64)
+    return np.asarray(found[np.abs(change) > LEAST_OUTPUT_ANSWER * np.abs(change).max(axis=0)], dtype=np.float64)
 
 
 def advanced(model: Identified, x: Tensor, mv: Tensor) -> Tensor:
@@ -104,14 +111,14 @@ def refuse_unstable(model: Identified) -> None:
 
 
 # ------------------------------------------------------------------------------------------------ reach of the horizon
-BEGUN = 0.01  # share of the change within AFTER samples, from which an answer has begun
+BEGUN = 0.01  # share of the change within STEP_SAMPLES samples, from which an answer has begun
 
 
 @dataclass(frozen=True, slots=True)
 class Sight:
     """Samples after a step of an MV: the first answer of the CV that answers last, and the settling of the answers."""
 
-    first: int  # AFTER + 1 where none is there by then
+    first: int  # STEP_SAMPLES + 1 where none is there by then
     settles: int
 
     @classmethod
@@ -120,7 +127,7 @@ class Sight:
         """From the model's step responses; ``mv_of`` as in ``horizon_for``."""
         responses = step_responses(model, mv_of)
         settling = settling_times(responses)
-        settles = int(np.ceil(np.quantile(settling, SHARE))) if settling.size else 0
+        settles = int(np.ceil(np.quantile(settling, COVERED_STEPS))) if settling.size else 0
         # At the inner levels each step is made up and down; their difference knows nothing of what came before.
         paired = responses.reshape(model.n_mv, -1, *responses.shape[1:])[:, 1:-1]
         apart = (paired[:, ::2] - paired[:, 1::2]).reshape(-1, *responses.shape[1:])
@@ -129,7 +136,7 @@ class Sight:
     def require(self, horizon: int) -> None:
         """LawError where the horizon ends before the first answer: the law would see no effect of its moves."""
         if self.first > horizon:
-            after = f"only {self.first}" if self.first <= AFTER else f"more than {AFTER}"
+            after = f"only {self.first}" if self.first <= STEP_SAMPLES else f"more than {STEP_SAMPLES}"
             raise LawError(
                 f"law 'predictive' looks {horizon} samples ahead, and a controlled variable answers {after} samples "
                 "after the MVs move: choose a longer sampling period, or a longer `horizon`"
@@ -151,5 +158,5 @@ def _first(y: Array) -> int:
     """The first sample in which an output answers to any step, of responses (runs, n)."""
     moved = np.abs(y - y[:, :1])
     change = moved.max(axis=1, keepdims=True)
-    clear = (moved > BEGUN * change) & (change >= LEAST_ANSWER * change.max()) & (change > 0)
-    return int(np.argmax(clear.any(axis=0))) if clear.any() else AFTER + 1
+    clear = (moved > BEGUN * change) & (change >= LEAST_OUTPUT_ANSWER * change.max()) & (change > 0)
+    return int(np.argmax(clear.any(axis=0))) if clear.any() else STEP_SAMPLES + 1

@@ -19,12 +19,12 @@ NOISE_FLOOR = (
 )
 LOAD_CHANGE = 3e-5  # scaled
 FIRST_LOAD = 0.05  # scaled, a period: standard deviation of a load before anything was seen of it
-FORGETTING = 0.5  # of the mean innovation
+INNOVATION_FORGETTING = 0.5  # of the mean innovation
 CALMING = 0.1  # share of the last innovation in the mean squares
 OUTLIER = 10.0  # largest innovation that counts, in the mean and in the squares: one alone would outgrow the other
 RISE = 7.0  # times its variance in pure noise: the square of the mean innovation at which the boost begins
 FULL = 4.0  # further such rises until it is full
-SWINGS = 4.0  # weight of innovations of both signs beyond those of noise
+SWING_WEIGHT = 4.0  # weight of innovations of both signs beyond those of noise
 BOOST = 1_000.0  # times its normal variance a load may move in a period then
 
 
@@ -136,11 +136,11 @@ class Observer(nn.Module):
         self.register_buffer("diagonal", torch.arange(self.n_y) * (n_a + 1))
         hold_numbers(
             self,
-            forgetting=FORGETTING,
-            rise=(2 - FORGETTING) / (RISE * FORGETTING),
+            forgetting=INNOVATION_FORGETTING,
+            rise=(2 - INNOVATION_FORGETTING) / (RISE * INNOVATION_FORGETTING),
             fall=1 / FULL,
             calming=CALMING,
-            swings=SWINGS,
+            swings=SWING_WEIGHT,
         )
 
     def forward(self, y: Tensor, v: Tensor, past: StateEstimate) -> tuple[StateEstimate, Tensor]:

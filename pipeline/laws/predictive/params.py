@@ -14,7 +14,7 @@ from loopwright.pipeline.laws.predictive.disturbance_model import Where
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Array, Signals
 
-LONGEST = 500  # samples of a horizon: the law's graph and its design grow with each
+LONGEST_HORIZON = 500  # samples of a horizon: the law's graph and its design grow with each
 Limits = tuple[float | None, ...] | None
 
 
@@ -23,23 +23,21 @@ class PredictiveParams:
     """Two knobs, and the numbers behind them, which follow from the model where they are None.
 
     ``speed`` > 0: 2 moves as boldly as a quarter of ``move_weight``. ``caution`` > 0: 2 follows loads as slowly
-    as a quarter of ``q_d``. ``horizon`` N samples, 8 to LONGEST; None: 90 % of the model's step responses settle
-    within it, 12 to 50. ``moves`` of each MV in a plan; None: 8 of one MV, 5 of each of several.
-    ``move_weight`` lambda > 0 of squared moves, mu = lambda (N - dead time)/10, MVs in units of half their range.
-    ``eps`` > 0: errors smaller than this share of a PV's standard deviation count by their square, larger ones
-    by their size. ``weights`` > 0 of the CVs in units of their standard deviation in the record, for the stated range
-    is often a sensor's and not the plant's; None: all 1. ``q_x`` and
-    ``q_d`` > 0: variance of the model's error and of the load's change a period, in units of the noise's; q_d
-    None: 3e-5 over the noise. ``jumps`` > 0: share of the observer's jump after a step of a load; less calms loops
-    over a plant that is not the model. ``loads`` act on the ``mvs`` or the ``outputs``.
-    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or
-    more; None: .5 of one MV, .25 of several, and with a search the least that the loops stand.
-    ``tuning``: ``given`` takes these numbers, ``search`` starts from them and chooses speed, caution,
-    horizon and jumps in closed loops over the model with errors and loads, drawn by ``seed``. ``mv_rate`` [mv]:
-    largest MV change a sample, which the plan knows, one number or one for each MV; None: that of the plant.
-    ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has none; None: no limits. A set point
-    beyond a limit counts as one at the limit. ``preview`` of the set points: ``held``, as they are now; ``ramp``, their
-    last slope goes on, as in a recipe of ramps; steps to come are not known.
+    as a quarter of ``q_d``. ``horizon`` N samples, 8 to LONGEST_HORIZON; None: 90 % of the model's step responses
+    settle within it, 12 to 50. ``moves`` of each MV in a plan; None: 8 of one MV, 5 of each of several. ``move_weight``
+    lambda > 0 of squared moves, mu = lambda (N - dead time)/10, MVs in units of half their range. ``eps`` > 0: errors
+    smaller than this share of a PV's standard deviation count by their square, larger ones by their size. ``weights`` >
+    0 of the CVs in units of their standard deviation in the record, for the stated range is often a sensor's and not
+    the plant's; None: all 1. ``q_x`` and ``q_d`` > 0: variance of the model's error and of the load's change a period,
+    in units of the noise's; q_d None: 3e-5 over the noise. ``jumps`` > 0: share of the observer's jump after a step of
+    a load; less calms loops over a plant that is not the model. ``loads`` act on the ``mvs`` or the ``outputs``.
+    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or more; None: .5 of
+    one MV, .25 of several, and with a search the least that the loops stand. ``tuning``: ``given`` takes these numbers,
+    ``search`` starts from them and chooses speed, caution, horizon and jumps in closed loops over the model with errors
+    and loads, drawn by ``seed``. ``mv_rate`` [mv]: largest MV change a sample, which the plan knows, one number or one
+    for each MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
+    none; None: no limits. A set point beyond a limit counts as one at the limit. ``preview`` of the set points:
+    ``held``, as they are now; ``ramp``, their last slope goes on, as in a recipe of ramps; steps to come are not known.
     """
 
     speed: float = 1.0
@@ -78,10 +76,10 @@ class PredictiveParams:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} is {value}; it must be at least {least}")
-        if self.horizon is not None and self.horizon > LONGEST:
+        if self.horizon is not None and self.horizon > LONGEST_HORIZON:
             raise ValueError(
-                f"horizon is {self.horizon}; give 8 to {LONGEST} samples, or leave it out: 50 or fewer suffice where "
-                "the sampling period suits the plant"
+                f"horizon is {self.horizon}; give 8 to {LONGEST_HORIZON} samples, or leave it out: 50 or fewer suffice "
+                "where the sampling period suits the plant"
             )
         if any(not 0 < w < np.inf for w in self.weights or ()):
             raise ValueError(f"weights are {list(self.weights or ())}; each must be above 0, and finite")

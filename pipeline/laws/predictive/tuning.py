@@ -13,14 +13,14 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.laws.predictive.tuning_loops import LoopErrors, side_by_side
 
-TRAVEL = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
-NEAR = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it
+TRAVEL_COST = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
+DEPARTURE_COST = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it
 COARSE = [(s, c) for s in (0.5, 1.0, 2.0) for c in (0.4, 1.0, 2.5)]  # factors of speed and caution
 FINE = [(s, c) for s in (0.7, 1.0, 1.4) for c in (0.6, 1.0, 1.6)]
-CALM = 0.05  # of the least error, that less travel may cost: a valve wears, and the model is not the plant
+CALM_COST = 0.05  # of the least error, that less travel may cost: a valve wears, and the model is not the plant
 HORIZONS = (0.7, 1.3)  # factors of the horizon that are tried
 JUMPS = (0.3, 0.1, 0.03)  # factors of the observer's jumps that are tried
-DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
+TRIED_DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
 FORGETS = 100.0  # growth of a small difference up to which a loop forgets it; most stay below 20
 
 Numbers = dict[str, float]
@@ -40,7 +40,7 @@ class TriedNumbers:
     @property
     def error(self) -> float:
         """J without its travel: the errors, and the price of numbers far from the first."""
-        return self.cost - TRAVEL * self.travel
+        return self.cost - TRAVEL_COST * self.travel
 
     def row(self) -> dict[str, float]:
         """Its numbers, what they gave, and its cost, by name."""
@@ -67,16 +67,16 @@ def judged(outcome: LoopErrors, given: LoopErrors, numbers: Sequence[Numbers]) -
     """
     sp, loads = (getattr(outcome, n).mean(axis=-1) / getattr(given, n).mean() for n in ("set_points", "loads"))
     travel = outcome.travel.mean(axis=-1)
-    rows = zip(numbers, 0.5 * (sp + loads) + TRAVEL * travel, sp, loads, travel, strict=True)
+    rows = zip(numbers, 0.5 * (sp + loads) + TRAVEL_COST * travel, sp, loads, travel, strict=True)
     return [TriedNumbers(dict(n), *map(float, figures)) for n, *figures in rows]
 
 
 def calmest(tried: Sequence[TriedNumbers]) -> TriedNumbers:
-    """The numbers of the least travel among those whose error is at most ``CALM`` more than the least.
+    """The numbers of the least travel among those whose error is at most ``CALM_COST`` more than the least.
 
     The travel is not in the limit: counted there too, it cost several times these 5 % on plants whose loads wander.
     """
-    limit = (1 + CALM) * min(c.error for c in tried)
+    limit = (1 + CALM_COST) * min(c.error for c in tried)
     return min((c for c in tried if c.error <= limit), key=lambda c: (c.travel, c.error))
 
 
@@ -104,7 +104,10 @@ def searched(
         new = [n for n in new if not any(n == c.numbers for c in tried)]
         if new:
             outcome = trials.run(side_by_side([law_of(n) for n in new]), len(new))
-            found = [replace(c, cost=c.cost + NEAR * _distance(c.numbers, start)) for c in judged(outcome, given, new)]
+            found = [
+                replace(c, cost=c.cost + DEPARTURE_COST * _distance(c.numbers, start))
+                for c in judged(outcome, given, new)
+            ]
             tried.extend(c for c in found if np.isfinite(c.cost))
         best = min(tried, key=lambda c: c.cost)
         show(len(tried))
@@ -144,7 +147,7 @@ def tuned(
     """
 
     def stood(numbers: Numbers, least: float) -> float | None:
-        offers = (d for d in DAMPINGS if d >= least)
+        offers = (d for d in TRIED_DAMPINGS if d >= least)
         return next((d for d in offers if trials.growth(law_of(numbers, d)) <= FORGETS), None)
 
     first = stood(start, 0.0) if damping is None else damping
@@ -161,7 +164,7 @@ def in_words(tried: Sequence[TriedNumbers]) -> str:
         f"{len(tried)} sets of numbers were tried in closed loops over the model with errors of gain, pace and dead "
         f"time, with loads and noise; the cost is {costs}. It is the mean of the errors at "
         "set points and under loads, each over that with the first numbers, .05 for a travel of 1 % of the MVs' range "
-        f"a sample, and a little for numbers far from the first. Among those within {100 * CALM:.0f} % of the least "
+        f"a sample, and a little for numbers far from the first. Among those within {100 * CALM_COST:.0f} % of the least "
         "cost without travel, those of the least travel are taken; a higher `speed` moves more and errs less, as the "
         "table shows."
     )

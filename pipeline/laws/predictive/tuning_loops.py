@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.laws.predictive.disturbance_model import REST_SAMPLES
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.identified import StateEquation, shift_rows
 from loopwright.pipeline.plants.noise import coloured, deviation
@@ -41,28 +42,30 @@ def side_by_side(laws: Sequence[M]) -> M:
 
 # ----------------------------------------------------------------------------------------------------------- the loops
 LOOPS = 6  # with set points, and as many with loads
-HOLDS = 5  # set points of a loop, and steps of its loads
-SETTLE = 300  # samples to come to rest
-STILL = 0.25  # share of a movement in the last third of SETTLE from which on it does not end; a level's is 1/3
+LOOP_HOLDS = 5  # set points of a loop, and steps of its loads
+# share of a movement in the last third of REST_SAMPLES from which on it does not end; a level's is 1/3
+UNENDED_MOVEMENT = 0.25
 SPAN = 4.0  # scaled: a record's outputs lie within two standard deviations
-REACH = 0.8  # of the MVs' range -1..1: where the set points are rests
-# By loop, with set points and with loads: as the model; slow, late by DEAD and with a high gain (of several MVs each by
-# its own sign); fast with a low one. Errors that come together are worse than each alone.
-GAINS = (0, 1, -1, 1, -1, 0)
-PACES = (0, -1, 1, -1, 1, 0)  # powers of 1 + the error of pace, by loop
-LATE = (0, 1, 0, 1, 0, 0)  # multiples of DEAD by which a plant is late, by loop; LATEST_LOOP has its own
+SET_POINT_REACH = 0.8  # of the MVs' range -1..1: where the set points are rests
+# By loop, with set points and with loads: as the model; slow, late by DEAD_TIME_ERROR and with a high gain (of several
+# MVs each by its own sign); fast with a low one. Errors that come together are worse than each alone.
+LOOP_GAINS = (0, 1, -1, 1, -1, 0)
+LOOP_PACES = (0, -1, 1, -1, 1, 0)  # powers of 1 + the error of pace, by loop
+# multiples of DEAD_TIME_ERROR by which a plant is late, by loop; LATEST_LOOP has its own
+LOOP_DEAD_TIMES = (0, 1, 0, 1, 0, 0)
 # The loop as late as the record leaves open, and as the model in all else: a model with another dead time explains the
 # record alike, so that its gain and its pace are no further off. Slow plants of a high gain that were so late, too,
 # cost 20 to 40 % of error under loads where the model's dead time was right.
 LATEST_LOOP = 5
-GAIN, PACE, DEAD = 0.25, 0.15, 0.5  # least errors; larger ones of pace and dead time calm loops that need no calm
-MOST = 1.0  # of each error
-LATEST = 0.25  # of the horizon, that plants answer later at most
+# least errors; larger ones of pace and dead time calm loops that need no calm
+GAIN_ERROR, PACE_ERROR, DEAD_TIME_ERROR = 0.25, 0.15, 0.5
+MOST_TUNED_ERROR = 1.0  # of each error
+LATEST_ANSWER = 0.25  # of the horizon, that plants answer later at most
 BIAS = 0.2  # of half an MV's range: the largest steps of a load at the MV
-LOAD = 0.6  # scaled, over the samples of the horizon: steps of a load at the output
-DRIFT = 0.15  # of BIAS and LOAD: a sample's share of a load that walks
+OUTPUT_LOAD = 0.6  # scaled, over the samples of the horizon: steps of a load at the output
+LOAD_WALK = 0.15  # of BIAS and OUTPUT_LOAD: a sample's share of a load that walks
 WALKS = (2, 5)  # loops whose loads walk; the loads of the others step
-NUDGE = 1e-9  # scaled
+STATE_NUDGE = 1e-9  # scaled
 AT_OUTPUT = (3, 4, 5)  # loops whose loads act on the outputs; those of the others on the MVs
 
 
@@ -87,8 +90,8 @@ class TuningLoops:
     the noise is the model's estimate, that of the measured disturbances included. Every set point is a rest of the
     loop's own plant, so that all are within reach. An output that never comes to rest, as a level, has set points
     within its record's range. Errors of gain and pace are what the record leaves open (``likely_error``), and no less
-    than ``GAIN`` and ``PACE``; plants are late by ``DEAD``, and one, which is the model in all else, by what the record
-    leaves open where that is more.
+    than ``GAIN_ERROR`` and ``PACE_ERROR``; plants are late by ``DEAD_TIME_ERROR``, and one, which is the model in all
+    else, by what the record leaves open where that is more.
     """
 
     model: Identified
@@ -110,13 +113,13 @@ class TuningLoops:
     def draw(cls, model: Identified, signals: Signals, horizon: int, seed: int) -> Self:
         """Loops with holds of twice the horizon, after one horizon that does not count; a seed gives the same loops."""
         rng, n_cv, n_mv, hold = np.random.default_rng(seed), len(signals.sp), model.n_mv, 2 * horizon
-        n, loops = horizon + HOLDS * hold, 2 * LOOPS
+        n, loops = horizon + LOOP_HOLDS * hold, 2 * LOOPS
         low, high = (np.array([getattr(s, end) for s in signals.mv]) for end in ("low", "high"))
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         signs = rng.choice([-1.0, 1.0], (loops, n_mv)) if n_mv > 1 else np.ones((loops, 1))
-        gain, pace, late = _errors(model, signs, LATEST * horizon)
+        gain, pace, late = _errors(model, signs, LATEST_ANSWER * horizon)
         # Every set point is a rest under MVs that act; a plant with another gain is given others for them.
-        acting = middle + half * rng.uniform(-REACH, REACH, (HOLDS + 1, loops, n_mv))
+        acting = middle + half * rng.uniform(-SET_POINT_REACH, SET_POINT_REACH, (LOOP_HOLDS + 1, loops, n_mv))
         acting[:, LOOPS:] = middle + 0.6 * (acting[:1, LOOPS:] - middle)
         x0, levels = _rests(model, acting, rng)
         levels[:, LOOPS:] = levels[:1, LOOPS:]
@@ -128,7 +131,7 @@ class TuningLoops:
         bias, load = np.zeros((n, loops, n_mv)), np.zeros((n, loops, model.n_y))
         for i in range(LOOPS):
             if i in AT_OUTPUT:
-                load[:, LOOPS + i, :n_cv] = LOAD / horizon * course[:, i, :n_cv]
+                load[:, LOOPS + i, :n_cv] = OUTPUT_LOAD / horizon * course[:, i, :n_cv]
             else:
                 bias[:, LOOPS + i] = BIAS * half * course[:, i, :n_mv]
         if model.recorded:
@@ -165,9 +168,9 @@ class TuningLoops:
         and by noise.
         """
         drawn = np.random.default_rng(0).normal(size=self.x0.shape)
-        x = torch.stack([self.x0, self.x0 + NUDGE * torch.from_numpy(drawn)])
+        x = torch.stack([self.x0, self.x0 + STATE_NUDGE * torch.from_numpy(drawn)])
         found = [((mv[1] - mv[0]).abs() / self._span).max() for _, _, mv in self._samples(law, x)]
-        return float(torch.nan_to_num(torch.stack(found), nan=torch.inf).max()) / NUDGE
+        return float(torch.nan_to_num(torch.stack(found), nan=torch.inf).max()) / STATE_NUDGE
 
     @property
     def _span(self) -> Tensor:
@@ -229,19 +232,23 @@ def _errors(model: Identified, signs: Array, latest: float) -> tuple[Array, Arra
     """
     gain, pace, dead = (
         likely_error(sd.numpy(), least, most)
-        for sd, least, most in ((model.gain_sd, GAIN, MOST), (model.pace_sd, PACE, MOST), (model.dead_sd, DEAD, latest))
+        for sd, least, most in (
+            (model.gain_sd, GAIN_ERROR, MOST_TUNED_ERROR),
+            (model.pace_sd, PACE_ERROR, MOST_TUNED_ERROR),
+            (model.dead_sd, DEAD_TIME_ERROR, latest),
+        )
     )
-    late = DEAD * np.array(LATE, dtype=np.float64)
-    late[LATEST_LOOP] = dead[0] if dead[0] > DEAD else 0.0
-    turned = np.tile(GAINS, 2)[:, None] * signs
-    return (1 + gain) ** turned, (1 + pace) ** np.tile(PACES, 2)[:, None], np.tile(late, 2)[:, None]
+    late = DEAD_TIME_ERROR * np.array(LOOP_DEAD_TIMES, dtype=np.float64)
+    late[LATEST_LOOP] = dead[0] if dead[0] > DEAD_TIME_ERROR else 0.0
+    turned = np.tile(LOOP_GAINS, 2)[:, None] * signs
+    return (1 + gain) ** turned, (1 + pace) ** np.tile(LOOP_PACES, 2)[:, None], np.tile(late, 2)[:, None]
 
 
 def _courses(rng: np.random.Generator, horizon: int, hold: int, count: int) -> Array:
     """Loads (n, LOOPS, count) within -1..1, none over the first horizon: steps, or random walks in the loops WALKS."""
-    steps = rng.uniform(0.5, 1.0, (HOLDS, LOOPS, 1)) * rng.choice([-1.0, 0.0, 1.0], (HOLDS, LOOPS, count))
+    steps = rng.uniform(0.5, 1.0, (LOOP_HOLDS, LOOPS, 1)) * rng.choice([-1.0, 0.0, 1.0], (LOOP_HOLDS, LOOPS, count))
     course = np.repeat(steps, hold, axis=0)
-    course[:, WALKS] = np.clip(np.cumsum(DRIFT * rng.normal(size=course[:, WALKS].shape), axis=0), -1, 1)
+    course[:, WALKS] = np.clip(np.cumsum(LOAD_WALK * rng.normal(size=course[:, WALKS].shape), axis=0), -1, 1)
     return np.concatenate([np.zeros((horizon, LOOPS, count)), course])
 
 
@@ -256,7 +263,7 @@ def _replayed(model: Identified, n: int, quiet: int, loops: int) -> Array:
 
 
 def _rests(model: Identified, mv: Array, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
-    """States (loops, n_x) after SETTLE samples under the first of mv (n, loops, n_mv), and outputs (n, loops, n_y).
+    """States (loops, n_x) after REST_SAMPLES under the first of mv (n, loops, n_mv), and outputs (n, loops, n_y).
 
     An output that never comes to rest has random values within its record's range, and where anything runs away the
     state is that of a rest in the middle of the record. All scaled.
@@ -264,10 +271,10 @@ def _rests(model: Identified, mv: Array, rng: np.random.Generator) -> tuple[Tens
     dv = model.v_center[model.n_mv :]
     v = torch.cat([torch.from_numpy(mv), dv.expand(*mv.shape[:-1], -1)], dim=-1)
     x = start = late = model.at_rest(model.y_center.expand(*v.shape[:-1], -1), v)
-    for k in range(SETTLE):
-        x, late = model(torch.cat([x, v], dim=-1)), x if k == SETTLE * 2 // 3 else late
+    for k in range(REST_SAMPLES):
+        x, late = model(torch.cat([x, v], dim=-1)), x if k == REST_SAMPLES * 2 // 3 else late
     moved, lately = ((x - since)[..., : model.n_y].abs().flatten(0, 1).median(dim=0).values for since in (start, late))
     free = torch.from_numpy(rng.uniform(-1.5, 1.5, (*mv.shape[:-1], model.n_y)))
     y = torch.nan_to_num(x[..., : model.n_y]).clamp(-SPAN / 2, SPAN / 2)
     within = x[0].abs().amax(dim=-1, keepdim=True) < 2 * SPAN
-    return torch.where(within, x[0], start[0]), torch.where(lately > STILL * moved, free, y)
+    return torch.where(within, x[0], start[0]), torch.where(lately > UNENDED_MOVEMENT * moved, free, y)

@@ -12,8 +12,8 @@ from torch import Tensor
 from loopwright.pipeline.laws.base import Analysis, Stepped, hold_numbers
 from loopwright.pipeline.laws.reference.reference_law import ReferenceLaw, ReferenceParams
 from loopwright.pipeline.laws.reference.reference_networks import (
-    BEFORE,
-    COURSE,
+    E_BEFORE,
+    FIRST_COURSE,
     IncrementalNetwork,
     R,
     TwoErrorNetwork,
@@ -25,7 +25,7 @@ from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
-POINTS = 21  # of MV and CV each, at which the roots are looked for
+ROOT_GRID_POINTS = 21  # of MV and CV each, at which the roots are looked for
 ERRORS = np.geomspace(1e-4, 1.0, 41)  # of the CV's range
 
 
@@ -107,15 +107,15 @@ class ModelReference(NetworkLaw):
         mv, cv = self.signals.mv[0], self.signals.sp[0]
         span = cv.high - cv.low
         grid = np.meshgrid(
-            np.linspace(mv.low, mv.high, POINTS),
-            np.linspace(cv.low, cv.high, POINTS),
+            np.linspace(mv.low, mv.high, ROOT_GRID_POINTS),
+            np.linspace(cv.low, cv.high, ROOT_GRID_POINTS),
             span * np.concatenate([-ERRORS[::-1], ERRORS]),
             indexing="ij",
         )
         u, y, e = (a.ravel() for a in grid)
         inputs = np.zeros((u.size, 4 + self.model.order))
-        inputs[:, R] = inputs[:, COURSE] = y + e
-        inputs[:, Y], inputs[:, U], inputs[:, BEFORE] = y, u, e
+        inputs[:, R] = inputs[:, FIRST_COURSE] = y + e
+        inputs[:, Y], inputs[:, U], inputs[:, E_BEFORE] = y, u, e
         gains: Array = ((self.network.act(self.trained.theta, inputs).mv - u) / e).reshape(grid[0].shape)
         return gains
 

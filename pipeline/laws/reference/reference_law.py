@@ -16,7 +16,7 @@ from loopwright.pipeline.models.memory import Named
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
-FOLLOWED = 0.01  # of the MV's range: an applied MV this close to the last request is the request
+REQUEST_BAND = 0.01  # of the MV's range: an applied MV this close to the last request is the request
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,7 @@ class ReferenceLaw(ControlLaw):
         phi, gamma = model.sampled(signals.period_s)
         self.register_buffer("phi", torch.from_numpy(phi.T.copy()))
         self.register_buffer("gamma", torch.from_numpy(gamma.T.copy()))
-        self.register_buffer("followed", FOLLOWED * (self.high - self.low))
+        self.register_buffer("followed", REQUEST_BAND * (self.high - self.low))
         self.n_state = 3 + model.order
         self.info = ("reference",)
 

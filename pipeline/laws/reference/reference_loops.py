@@ -12,8 +12,9 @@ from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.models.static.mlp import scaled_layers
 from loopwright.pipeline.plants.simulator import Array, Signals
 
-LONGEST, AT_REST = 20_000, 1e-10  # periods until a free run rests, and the relative change of a period that is rest
-CURVE = 200  # steady states, between which are drawn
+# periods until a free run rests, and the relative change of a period that is rest
+LONGEST_FREE_RUN, FREE_RUN_AT_REST = 20_000, 1e-10
+CURVE_STATES = 200  # steady states, between which are drawn
 INSET = 0.02  # of the MV's range: steady states nearer to its ends are not trained on
 LOADED = (0.1, 0.8)  # of a hold: when a load may come
 
@@ -82,9 +83,9 @@ class PlantNetwork:
         Raises LawError where a run does not come to rest, or the CV has an extremum over the MV.
         """
         x, u = np.tile(start, (len(mv), 1)), mv[:, None]
-        for _ in range(LONGEST):
+        for _ in range(LONGEST_FREE_RUN):
             before, x = x, self.step(x, u)[0]
-            if np.abs(x - before).max() < AT_REST * np.abs(x).max():
+            if np.abs(x - before).max() < FREE_RUN_AT_REST * np.abs(x).max():
                 break
         else:
             raise LawError("the plant's network does not come to rest under a held MV: it cannot be trained through")
@@ -114,7 +115,7 @@ class Loops:
         mv, pv = signals.mv[0], signals.pv
         inset = INSET * (mv.high - mv.low)
         middle = np.array([(s.low + s.high) / 2 for s in pv])
-        states, mvs = plant.steady_curve(middle, np.linspace(mv.low + inset, mv.high - inset, CURVE))
+        states, mvs = plant.steady_curve(middle, np.linspace(mv.low + inset, mv.high - inset, CURVE_STATES))
         sp = signals.sp[0]
         low, high = max(states[0, 0], sp.low), min(states[-1, 0], sp.high)
         if not low < high:

@@ -18,10 +18,10 @@ import torch
 from loopwright.pipeline.models.memory import AffineMap, Named
 from loopwright.pipeline.plants.simulator import Array, Signals
 
-R, Y, U, BEFORE, COURSE = 0, 1, 2, 3, 4  # columns of the inputs
+R, Y, U, E_BEFORE, FIRST_COURSE = 0, 1, 2, 3, 4  # columns of the inputs
 RANGE = 20.0  # of an exponent: beyond it a weight is nothing, or far too large
-NEAR, STEP, SPEED = 0.07, 0.3, 0.15  # of the CV's range: usual e, r - y_m and x_m,i, i >= 2
-REACH = (0.15, 0.35)  # of the MV's range: a move's scale at its low end, and what is added up to its high end
+USUAL_ERROR, USUAL_STEP, USUAL_SPEED = 0.07, 0.3, 0.15  # of the CV's range: usual e, r - y_m and x_m,i, i >= 2
+MOVE_REACH = (0.15, 0.35)  # of the MV's range: a move's scale at its low end, and what is added up to its high end
 
 
 class Action(NamedTuple):
@@ -125,10 +125,10 @@ class IncrementalNetwork(Network):
             [
                 (p["u"] - low) / reach,
                 (p["y"] - middle) / (span / 2),
-                e / (NEAR * span),
-                (e - p["before"]) / (NEAR * span),
-                (p["r"] - p["course"][..., :1]) / (STEP * span),
-                p["course"][..., 1:] / (SPEED * span),
+                e / (USUAL_ERROR * span),
+                (e - p["before"]) / (USUAL_ERROR * span),
+                (p["r"] - p["course"][..., :1]) / (USUAL_STEP * span),
+                p["course"][..., 1:] / (USUAL_SPEED * span),
             ],
             dim=-1,
         )
@@ -136,7 +136,7 @@ class IncrementalNetwork(Network):
     def reach(self, p: Named) -> torch.Tensor:
         """c0 + c1 u(k-1) in the MV's unit."""
         low, span = self._mv
-        return REACH[0] * span + REACH[1] * (p["u"] - low)
+        return MOVE_REACH[0] * span + MOVE_REACH[1] * (p["u"] - low)
 
     def act(self, theta: Array, inputs: Array) -> Action:
         """The MV before its limits."""
@@ -148,7 +148,7 @@ class IncrementalNetwork(Network):
         h0, h1 = np.tanh(still), np.tanh(still + errors @ table[2:])
         move = (h1 - h0) @ out
         low, span = self._mv
-        reach = REACH[0] * span + REACH[1] * (inputs[:, U] - low)
+        reach = MOVE_REACH[0] * span + MOVE_REACH[1] * (inputs[:, U] - low)
         slope = (1 - h1 * h1) * out
         both = slope - (1 - h0 * h0) * out
         by_table = np.concatenate([z[:, :, None] * both[:, None, :], errors[:, :, None] * slope[:, None, :]], axis=1)
@@ -159,8 +159,8 @@ class IncrementalNetwork(Network):
             inputs[:, U] + reach * move,
             by_theta * reach[:, None],
             by_input[:, Y],
-            1 + REACH[1] * move + by_input[:, U],
-            by_input[:, BEFORE],
+            1 + MOVE_REACH[1] * move + by_input[:, U],
+            by_input[:, E_BEFORE],
         )
 
 
@@ -192,7 +192,7 @@ class TwoErrorNetwork(Network):
     def features(self, p: Named) -> torch.Tensor:
         """[e, r - y], shape (..., 2), in scaled units."""
         span = self._cv[1]
-        return torch.cat([p["course"][..., :1] - p["y"], p["r"] - p["y"]], dim=-1) / (NEAR * span)
+        return torch.cat([p["course"][..., :1] - p["y"], p["r"] - p["y"]], dim=-1) / (USUAL_ERROR * span)
 
     def act(self, theta: Array, inputs: Array) -> Action:
         """The MV before its limits."""
@@ -206,7 +206,7 @@ class TwoErrorNetwork(Network):
         by_theta = np.concatenate([by_table, slope, h, np.ones((len(inputs), 1))], axis=1)
         by_input = slope @ table.T @ matrix.T * span
         mv = low + span * (h @ out + level)
-        return Action(mv, span * by_theta, by_input[:, Y], by_input[:, U], by_input[:, BEFORE])
+        return Action(mv, span * by_theta, by_input[:, Y], by_input[:, U], by_input[:, E_BEFORE])
 
 
 @dataclass(frozen=True)
@@ -232,8 +232,8 @@ class TrainablePi(Trainable):
         """The MV before its limits."""
         kc, ti = self.settings(theta)
         share = self.signals.period_s / ti
-        e = inputs[:, COURSE] - inputs[:, Y]
-        move = kc * (e - inputs[:, BEFORE] + share * e)
+        e = inputs[:, FIRST_COURSE] - inputs[:, Y]
+        move = kc * (e - inputs[:, E_BEFORE] + share * e)
         by_theta = np.stack([move, kc * share * e], axis=1)
         ones = np.ones(len(inputs))
         return Action(inputs[:, U] + move, by_theta, -kc * (1 + share) * ones, ones, -kc * ones)

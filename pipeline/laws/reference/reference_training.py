@@ -22,7 +22,7 @@ from loopwright.pipeline.tuning.reference_model import ReferenceModel
 
 P = TypeVar("P", bound=Trainable)
 
-DAMPINGS = 8  # tries an iteration
+DAMPING_TRIES = 8  # tries an iteration
 
 
 class LoopSums(NamedTuple):
@@ -165,7 +165,7 @@ def _descend(
     rows = [(now.tracking, judged.tracking)]
     best, least, kept, damping = 0, _finite(judged.cost), theta, 1e-2
     for i in range(1, options.iterations + 1):
-        for _ in range(DAMPINGS):
+        for _ in range(DAMPING_TRIES):
             diagonal = np.diag(now.square)
             step = np.linalg.solve(now.square + damping * np.diag(diagonal + 1e-9 * diagonal.mean()), now.slope)
             tried = sums(theta + step, 0)

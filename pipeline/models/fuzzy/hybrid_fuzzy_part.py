@@ -23,9 +23,10 @@ from loopwright.pipeline.records.record import Record
 How = Literal["tied", "global", "local"]
 MODES: Mapping[int, str] = {1: "hot", 2: "cold"}
 SIGN: Mapping[str, float] = {"b_hot": 1.0, "b_cold": -1.0}
-LEAST = 0.01  # [degC a period] that full flow does at least: at its inlet's temperature a valve does nothing
-ROUNDING = 1e-6  # of a mode that went through a file
-SHARE = 1e-3  # of a unit vector: from where on a coefficient has part in what the data leave open
+# [degC a period] that full flow does at least: at its inlet's temperature a valve does nothing
+LEAST_VALVE_EFFECT = 0.01
+MODE_ROUNDING = 1e-6  # of a mode that went through a file
+OPEN_COEFFICIENT = 1e-3  # of a unit vector: from where on a coefficient has part in what the data leave open
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +44,7 @@ class Transitions:
             names = ", ".join(s.name for s in (*record.pv_signals, *record.mv_signals))
             raise ModelError(f"a hybrid fuzzy model needs the PVs T, T_w and the MVs k_M, mode; the record has {names}")
         name, mode = record.mv_signals[1].name, np.rint(record.mv[:, 1])
-        strange = record.mv[~np.isin(mode, list(MODES)) | (np.abs(record.mv[:, 1] - mode) > ROUNDING), 1]
+        strange = record.mv[~np.isin(mode, list(MODES)) | (np.abs(record.mv[:, 1] - mode) > MODE_ROUNDING), 1]
         if strange.size:
             raise ModelError(f"the record's {name} is {strange[0]:g} somewhere; it must be 1 (hot) or 2 (cold)")
         k = record.starts(1)
@@ -69,7 +70,7 @@ def identify(data: Transitions, centres: Sequence[float], how: How) -> HybridFuz
     r_j changes nothing there: data cannot tell. Rules that are fitted together therefore have an r without
     slope over the centres, each counted by its share of the data; what follows T_w belongs to a1.
 
-    The hot valve heats and the cold one cools, LEAST at least, so that the model has an inverse: where the
+    The hot valve heats and the cold one cools, LEAST_VALVE_EFFECT at least, so that the model has an inverse: where the
     jacket is as warm as the inlet, b is nothing and its estimate may have either sign.
 
     The core is one least-squares line, T(k+1) - T(k) = c_w (T_w(k) - T(k)), c_t = 1 - c_w: it exchanges
@@ -151,7 +152,7 @@ def _blended(rules: Rules, columns: Array, target: Array, labels: Sequence[tuple
 
 
 def _solved(design: Array, target: Array, names: Sequence[str]) -> Array:
-    """Least squares in which every b has the sign of its valve, by fixing those that would not at LEAST.
+    """Least squares in which every b has the sign of its valve, by fixing those that would not at LEAST_VALVE_EFFECT.
 
     Raises ModelError as ``_least_squares`` does.
     """
@@ -162,10 +163,10 @@ def _solved(design: Array, target: Array, names: Sequence[str]) -> Array:
         found[free] = _least_squares(
             design[:, free], rest, [n for n, is_free in zip(names, free, strict=True) if is_free]
         )
-        wrong = free & (sign != 0) & (sign * found < LEAST)
+        wrong = free & (sign != 0) & (sign * found < LEAST_VALVE_EFFECT)
         if not wrong.any():
             return found
-        found[wrong] = LEAST * sign[wrong]
+        found[wrong] = LEAST_VALVE_EFFECT * sign[wrong]
         free &= ~wrong
 
 
@@ -179,7 +180,7 @@ def _least_squares(design: Array, target: Array, names: Sequence[str]) -> Array:
     solution, _, rank, _ = np.linalg.lstsq(scaled, target, rcond=None)
     if rank < design.shape[1]:
         unseen = np.linalg.norm(np.linalg.svd(scaled.T @ scaled)[2][int(rank) :], axis=0)
-        which = dict.fromkeys(name for name, share in zip(names, unseen, strict=True) if share > SHARE)
+        which = dict.fromkeys(name for name, share in zip(names, unseen, strict=True) if share > OPEN_COEFFICIENT)
         raise ModelError(
             f"the data do not determine {', '.join(which)}: record pulses of both modes over the whole range of "
             "the jacket's temperature, or leave out centres where there are none"

@@ -49,10 +49,10 @@ BEGINNING = 4 * BEGIN
 PATIENCE = 30
 """Iterations without a better held-out error that end a network's fit."""
 
-AROUND = 1.5
+RETURN_DISTANCE = 1.5
 """Distance of the states from their middle, over that of the visited ones, from which a usable network returns."""
 
-HELD, RESTS = 60, 0.9
+HELD_INPUTS, RESTING_SHARE = 60, 0.9
 """Inputs that are held, and the least share of them under which a usable network comes to rest."""
 
 
@@ -315,10 +315,10 @@ def wild(model: Dynamics, problem: Problem) -> bool:
     """
     n_y, v = problem.data.y.shape[1], _held_inputs(problem)
     x, share = rests_under(model, problem)
-    if not np.abs(x[:, :n_y]).max() < problem.farthest or share < RESTS:
+    if not np.abs(x[:, :n_y]).max() < problem.farthest or share < RESTING_SHARE:
         return True
     middle = np.median(x, axis=0)
-    x = middle + AROUND * (x - middle)
+    x = middle + RETURN_DISTANCE * (x - middle)
     for shift in range(0, len(v), 7):
         x, _ = model.hold(x, np.roll(v, -shift, axis=0), 100)
     return not np.abs(x[:, :n_y]).max() < problem.farthest
@@ -333,7 +333,7 @@ def rests_under(model: Dynamics, problem: Problem) -> tuple[Array, float]:
 def _held_inputs(problem: Problem) -> Array:
     """Inputs (n, n_v) of the data, spread evenly over its rows."""
     v = problem.data.v
-    return v[np.linspace(0, len(v) - 1, HELD).astype(np.int64)]
+    return v[np.linspace(0, len(v) - 1, HELD_INPUTS).astype(np.int64)]
 
 
 def misses(model: Dynamics, starts: list[Array], train: list[Stretch], ratio: float, correction: float) -> bool:

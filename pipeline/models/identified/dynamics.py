@@ -195,7 +195,7 @@ def hold_inputs(
 
 
 # ----------------------------------------------------------------------------------------------------------- the model
-EXPLODED = 1e4
+EXPLODED_STATE = 1e4
 """Scaled state beyond which a free run is given up."""
 
 
@@ -312,7 +312,7 @@ class Dynamics(StateEquation):
             drive = np.concatenate([data.v @ b + self.c, data.v @ w1 + self.b1], axis=1)
             before, after = np.empty((len(data), n_x)), np.empty((len(data), n_x))
             y, x = np.ascontiguousarray(data.y), np.asarray(start, dtype=np.float64)
-            kept = run_rows(matrix, w2, drive, y, correction, gain, x, EXPLODED, before, after)
+            kept = run_rows(matrix, w2, drive, y, correction, gain, x, EXPLODED_STATE, before, after)
             return (before, after) if kept else None
 
         return run

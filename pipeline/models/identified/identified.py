@@ -15,6 +15,7 @@ from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.steady_states import central_map, rest_map
 from loopwright.pipeline.plants.simulator import Array
+from loopwright.pipeline.tuning.responses import ANSWERED_CHANGE
 
 
 class Identified(Model):
@@ -115,10 +116,6 @@ class Identified(Model):
         return torch.cat([seen, x[..., self.n_y :]], dim=-1)
 
 
-ANSWERS = 0.1
-"""Share of the fastest change of an output in a step response below which it has not answered yet."""
-
-
 def remembering(model: Dynamics, delays: Sequence[int]) -> Dynamics:
     """The model whose input j acts ``delays[j]`` periods later: x = [x of the model, past inputs, newest first]."""
     n, n_v, total = model.n_x, model.n_v, int(sum(delays))
@@ -190,7 +187,7 @@ def dead_periods(model: Dynamics, data: ScaledRecord, length: int = 60) -> Array
     size = 0.5 * data.v.std(axis=0)
     response = step_responses(model, start, middle, size, length)[..., : data.y.shape[1]]
     change = np.abs(np.diff(response, axis=1, prepend=0.0))
-    answers = change > ANSWERS * change.max(axis=1, keepdims=True)
+    answers = change > ANSWERED_CHANGE * change.max(axis=1, keepdims=True)
     return np.asarray(answers.any(axis=2).argmax(axis=1), dtype=np.float64)
 
 

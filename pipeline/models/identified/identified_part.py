@@ -32,7 +32,7 @@ from loopwright.pipeline.models.identified.steady_states import stability_figure
 from loopwright.pipeline.models.identified.structure import Cells, Problem, Structure
 from loopwright.pipeline.models.identified.structure_search import Searched, Selection, StructureSearch
 from loopwright.pipeline.models.identified.verdict import (
-    STEP,
+    STEP_SDS,
     dead_times,
     free_run_figures,
     gain_figures,
@@ -48,7 +48,7 @@ from loopwright.serving.manifest import Signal
 
 Figures = Mapping[str, Mapping[str, Any]]
 
-OUTSIDE = 0.02
+OUTSIDE_SHARE = 0.02
 """Share of held-out rows outside the range of the training rows above which a warning says so."""
 
 LIKELY_SDS = 2.0
@@ -57,13 +57,13 @@ LIKELY_SDS = 2.0
 LOAD_ROWS = 8_000
 """Rows at most whose loads go with the model."""
 
-PARTS = 40
+INDEPENDENT_PARTS = 40
 """Parts of the held-out rows that are independent, for all that counts: neighbouring rows of a run err alike."""
 
-DRAWS = 12
+BAND_DRAWS = 12
 """Models drawn from the covariance of the parameters, for the bands."""
 
-NEAR = 1.05
+NEAR_FINALIST = 1.05
 """Held-out error, relative to the chosen one's, up to which a finalist's fits count for the bands."""
 
 NEAR_BY_ROWS = 1.002
@@ -146,7 +146,7 @@ class IdentifiedPart(Part):
         runs, predictions = free_run_figures(problem, selection.chosen, scales, names)
         curves = response_curves(bands, rows)
         cells = Cells.of(bands, rows, n_mv, curves.shape[2]) if structure.n_hidden else None
-        size = STEP * rows.v.std(axis=0)
+        size = STEP_SDS * rows.v.std(axis=0)
         proven = answers(curves, structure, problem.data, size, n_mv, cells, weights)
         n_cv = min(len(source.signals.sp), n_y)
         controlled = {place: answer for place, answer in proven[0].items() if place[0] < n_cv}
@@ -170,7 +170,7 @@ class IdentifiedPart(Part):
             f"{name}: {runs[name]['outside_training']:.0%} of the held-out rows leave the range of the training rows; "
             "their error says little of the model elsewhere"
             for name in (s.name for s in pvs)
-            if runs[name]["outside_training"] > OUTSIDE
+            if runs[name]["outside_training"] > OUTSIDE_SHARE
         ]
         gain_table = gain_figures(bands, rows, scales, pvs, inputs)
         for pair in problem.known.pairs:
@@ -301,8 +301,8 @@ def _visited(model: Dynamics, data: Sequence[Stretch], correction: float) -> lis
 def _bands(selection: Selection) -> tuple[list[Dynamics], Array]:
     """The fits that show how sure the figures are: those of the chosen structure, and of finalists as good as it.
 
-    And how likely each is (fits,): by its held-out error over the least of the same rows, as ``PARTS`` independent ones
-    tell it.
+    And how likely each is (fits,): by its held-out error over the least of the same rows, as ``INDEPENDENT_PARTS``
+    independent ones tell it.
     """
     chosen = selection.chosen
     same = [
@@ -311,7 +311,7 @@ def _bands(selection: Selection) -> tuple[list[Dynamics], Array]:
         if t.structure.delays == chosen.structure.delays
         and t.against <= chosen.against
         and (t.structure.n_hidden > 0) == (chosen.structure.n_hidden > 0)
-        and t.error <= (NEAR if selection.innovations is None else NEAR_BY_ROWS) * chosen.error
+        and t.error <= (NEAR_FINALIST if selection.innovations is None else NEAR_BY_ROWS) * chosen.error
     ]
     fits = [
         (fold, f)
@@ -322,7 +322,7 @@ def _bands(selection: Selection) -> tuple[list[Dynamics], Array]:
     if not fits:
         return [chosen.of_fold(0)[0].model.plant], np.ones(1)
     least = {k: min(f.held_out for fold, f in fits if fold == k) for k, _ in fits}
-    weights = np.array([(least[k] / f.held_out) ** PARTS if f.held_out > 0 else 1.0 for k, f in fits])
+    weights = np.array([(least[k] / f.held_out) ** INDEPENDENT_PARTS if f.held_out > 0 else 1.0 for k, f in fits])
     return [f.model.plant for _, f in fits], weights
 
 
@@ -333,9 +333,11 @@ def _as_likely(problem: Problem, structure: Structure, model: Dynamics, seed: in
     if isinstance(model, Innovations) and errors is not None:
         size = np.sqrt(np.mean(errors**2, axis=0))
         near, parts = model.rescaled(size), [replace(s, y=s.y / size) for s in whole]
-        return [of.rescaled(1 / size).plant for of in drawn(near, fit_starts(near, parts), parts, DRAWS, seed=seed)]
+        return [
+            of.rescaled(1 / size).plant for of in drawn(near, fit_starts(near, parts), parts, BAND_DRAWS, seed=seed)
+        ]
     starts = fit_starts(model, whole, structure.correction)
-    return drawn(model, starts, whole, DRAWS, structure.correction, seed)
+    return drawn(model, starts, whole, BAND_DRAWS, structure.correction, seed)
 
 
 def _table(selection: Selection) -> list[dict[str, Any]]:

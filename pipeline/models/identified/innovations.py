@@ -24,20 +24,20 @@ from loopwright.pipeline.plants.simulator import Array
 LOADS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Variances of a load's change a row, over that of the measurement, from which a fit may begin."""
 
-ERRORS = (0.03, 1.0)
+STATE_ERRORS = (0.03, 1.0)
 """Variances of the states' errors, over that of the measurement."""
 
-BURN_IN = 0.1  # share of a stretch in which the filter forgets its start, within LEAST to MOST rows
-LEAST, MOST = 20, 300
+BURN_IN = 0.1  # share of a stretch in which the filter forgets its start, within LEAST_BURN_IN to MOST_BURN_IN rows
+LEAST_BURN_IN, MOST_BURN_IN = 20, 300
 """Rows at the beginning of a stretch that do not count while the filter forgets its start: a share, and its ends."""
 
-AHEAD = 30
+PREDICTED_AHEAD = 30
 """Rows that figures of a model with its noise are predicted ahead, at most: about as far as a controller looks."""
 
-ALIKE = 1e-6
+ALIKE_OUTPUTS = 1e-6
 """Share of the innovations' variance that two outputs do not have in common."""
 
-LEAST_NOISE = 0.01
+LEAST_NOISE_SHARE = 0.01
 """Share of an innovation's variance that is at least measurement noise."""
 
 
@@ -142,7 +142,7 @@ def forgetting(model: Innovations, covariance: Array) -> Innovations:
     Source: B. D. O. Anderson, J. B. Moore, Optimal filtering, 1979, section 9.3 (innovations representations).
     """
     n_y, a, gain = model.gain.shape[1], model.a, model.gain
-    r = covariance + ALIKE * np.trace(covariance) * np.eye(n_y)  # outputs may be copies of each other
+    r = covariance + ALIKE_OUTPUTS * np.trace(covariance) * np.eye(n_y)  # outputs may be copies of each other
     c = np.eye(n_y, model.n_x)
     if model.n_hidden or np.abs(np.linalg.eigvals(a - a @ gain @ c)).max() < 1:
         return model
@@ -171,7 +171,7 @@ def innovations(model: Dynamics, data: Sequence[Stretch]) -> Array | None:
     return np.concatenate(found)
 
 
-def ahead(model: Innovations, stretch: Stretch, rows: int = AHEAD) -> tuple[Array, Array]:
+def ahead(model: Innovations, stretch: Stretch, rows: int = PREDICTED_AHEAD) -> tuple[Array, Array]:
     """(measured, predicted) (n, n_y) over the rows that count, predicted 1 to ``rows`` rows ahead in turn.
 
     Every ``rows`` rows a run without correction begins from the filter's state. Not finite where one explodes.
@@ -209,7 +209,7 @@ def _filtered(model: Dynamics, stretch: Stretch) -> Array | None:
 
 def _begins(stretch: Stretch) -> int:
     """The first row that counts."""
-    return min(int(np.clip(BURN_IN * len(stretch), LEAST, MOST)), len(stretch) // 2)
+    return min(int(np.clip(BURN_IN * len(stretch), LEAST_BURN_IN, MOST_BURN_IN)), len(stretch) // 2)
 
 
 def typical(errors: Array | None) -> float:
@@ -227,7 +227,7 @@ def begun(plant: Dynamics, data: Sequence[Stretch]) -> Innovations:
     n_y = data[0].y.shape[1]
     model = with_loads(plant, n_y)
     best, least = None, np.inf
-    for errors in ERRORS:
+    for errors in STATE_ERRORS:
         for loads in LOADS:
             gain = filter_gain(model.a, n_y, errors, loads)
             if gain is None:
@@ -308,4 +308,4 @@ def noise_of_filter(model: Innovations, errors: Array) -> Array:
     covariance = errors.T @ errors / max(len(errors), 1)
     left = (np.eye(n_y) - model.gain[:n_y]) @ covariance
     # A filter that believes the measurement wholly still leaves the digits of the transmitter.
-    return np.asarray(np.sqrt(np.maximum(np.diag(left), LEAST_NOISE * np.diag(covariance))))
+    return np.asarray(np.sqrt(np.maximum(np.diag(left), LEAST_NOISE_SHARE * np.diag(covariance))))

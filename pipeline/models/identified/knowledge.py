@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from loopwright.pipeline.config.known import NONE, NOTHING, SURE, Known
+from loopwright.pipeline.config.known import CONTRADICTION_SDS, NO_ANSWER, NONE, Known
 from loopwright.pipeline.historian.answers import Beside
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
@@ -16,7 +16,7 @@ from loopwright.pipeline.models.identified.steady_states import central_gain
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 
-ROUNDING = 1e-6
+DEAD_TIME_ROUNDING = 1e-6
 """Share of a period: a dead time of whole periods in seconds is that many periods."""
 
 Model = TypeVar("Model", bound=Dynamics)
@@ -57,7 +57,7 @@ class Knowledge:
             low, high = (end * float(scales.v_scale[j] / scales.y_scale[i]) for end in one.gains)
             delays = None
             if one.dead_s is not None:
-                first, last = (int(np.floor(s / period_s + ROUNDING)) for s in one.dead_s)
+                first, last = (int(np.floor(s / period_s + DEAD_TIME_ROUNDING)) for s in one.dead_s)
                 delays = first, last
             pairs.append(Pair(i, j, low, high, one.sign == NONE, delays))
         return cls(tuple(pairs), len(pvs))
@@ -141,7 +141,7 @@ class Knowledge:
         for k, p in enumerate(self.pairs):
             low, high = p.low, p.high
             if p.none:
-                low, high = -NOTHING / max(size[p.input], 1e-300), NOTHING / max(size[p.input], 1e-300)
+                low, high = -NO_ANSWER / max(size[p.input], 1e-300), NO_ANSWER / max(size[p.input], 1e-300)
             elif integrates:
                 low, high = (0.0 if low >= 0 else -np.inf), (0.0 if high <= 0 else np.inf)
             value = gain[p.output, p.input]
@@ -193,7 +193,7 @@ def _other(one: Known, of: Mapping[str, Any], nothing: float) -> bool:
     """Whether the model itself has another sign or gain, beyond how its fits differ; of a rate its sign alone."""
     if one.way * of["gain"] < 0 or of["rate"]:
         return bool(one.way * of["gain"] < 0)
-    return one.excludes(of["gain"], of["spread"] / SURE, nothing if one.sign == NONE else 0.0)
+    return one.excludes(of["gain"], of["spread"] / CONTRADICTION_SDS, nothing if one.sign == NONE else 0.0)
 
 
 def _nothing(one: Known, record: Record) -> float:
@@ -201,4 +201,4 @@ def _nothing(one: Known, record: Record) -> float:
     signals = [(s.name, v) for group in ("pv", "mv", "dv")
                for s, v in zip(getattr(record, f"{group}_signals"), getattr(record, group).T, strict=True)]  # fmt: skip
     sd = {name: float(values.std()) for name, values in signals}
-    return NOTHING * sd[one.pv] / max(sd[one.input], 1e-300)
+    return NO_ANSWER * sd[one.pv] / max(sd[one.input], 1e-300)

@@ -14,19 +14,19 @@ from loopwright.pipeline.models.identified.linear_start import within_unit_circl
 from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.structure import CandidateFits, Structure
 
-MOST_STATES = 18
+MOST_LAGGED_STATES = 18
 """States of a lagged start beyond which it is not tried."""
 
-LAGS = ((2, 2), (3, 3), (2, 5), (2, 10))
+OFFERED_LAGS = ((2, 2), (3, 3), (2, 5), (2, 10))
 """Lags of the outputs and of the inputs on offer."""
 
-SHORT, LONG = 10, 30
+FIRST_ROUND_ITERATIONS, FINISHING_ITERATIONS = 10, 30
 """Iterations of the first round, and of the fits that finish it."""
 
-NEARLY = 1.02
+EQUAL_CANDIDATES = 1.02
 """Relative error up to which candidates of the first round count as equal, the smaller ones first."""
 
-SETTLING = 0.98
+LARGEST_START_POLE = 0.98
 """Largest pole of a candidate that begins again inside the unit circle."""
 
 FINISHED, SMALLEST = 3, 3
@@ -64,18 +64,20 @@ class LinearSearch:
         n_y, n_v = self.rounds.problem.data.y.shape[1], self.rounds.problem.data.v.shape[1]
         options = list(dict.fromkeys(s.delays for s, _ in self.starts))
         structures = [Structure("balanced", n, (0, 0), d) for d in options for n in orders]
-        for y_lags, v_lags in LAGS if lagged else ():
+        for y_lags, v_lags in OFFERED_LAGS if lagged else ():
             order = y_lags * n_y + (v_lags - 1) * n_v
-            if order <= MOST_STATES:
+            if order <= MOST_LAGGED_STATES:
                 structures.extend(Structure("lagged", order, (y_lags, v_lags), d) for d in options)
-        offered = [replace(s, correction=correction) for s in self.rounds.affordable(structures, SHORT, 0.3)]
-        tasks = [FitTask(s, 0, SHORT, start=self.start(s, 0)) for s in offered]
+        offered = [
+            replace(s, correction=correction) for s in self.rounds.affordable(structures, FIRST_ROUND_ITERATIONS, 0.3)
+        ]
+        tasks = [FitTask(s, 0, FIRST_ROUND_ITERATIONS, start=self.start(s, 0)) for s in offered]
         trials, reasons = self.rounds.trials(tasks, "linear models, first fits")
         finite = [t for t in trials if np.isfinite(t.error)]
         if not finite:
             why = reasons[0] if reasons else "every free run over held-out rows explodes"
             raise ModelError(f"no linear model fits the record: {why}")
-        limit = NEARLY * min(finite, key=lambda t: t.rank).error
+        limit = EQUAL_CANDIDATES * min(finite, key=lambda t: t.rank).error
         return sorted(
             finite, key=lambda t: (t.against, t.error, 0) if t.error > limit else (t.against, 0.0, t.structure.order)
         )
@@ -91,7 +93,7 @@ class LinearSearch:
         kept.extend(t for t in (*balanced[:2], *lagged[:2], *small) if t not in kept)
         folds = range(len(self.rounds.problem.folds))
         tasks = [
-            FitTask(t.structure, k, LONG, start=self.start(t.structure, k), begun=t.fits.get((k, 0)))
+            FitTask(t.structure, k, FINISHING_ITERATIONS, start=self.start(t.structure, k), begun=t.fits.get((k, 0)))
             for t in kept
             for k in folds
         ]
@@ -106,20 +108,20 @@ class LinearSearch:
             self.rounds.starts([replace(s, order=0, correction=0.0) for s in structures if s.start == "balanced"])
         )
         tasks = [
-            FitTask(s, k, SHORT + LONG, start=self.start(s, k))
+            FitTask(s, k, FIRST_ROUND_ITERATIONS + FINISHING_ITERATIONS, start=self.start(s, k))
             for s in structures
             for k in range(len(self.rounds.problem.folds))
         ]
         return smallest_first(self.rounds.trials(tasks, "linear models whose MV acts in its own row of the record")[0])
 
     def settling(self, trials: Sequence[CandidateFits]) -> list[CandidateFits]:
-        """The best candidates again, begun with all poles within ``SETTLING``.
+        """The best candidates again, begun with all poles within ``LARGEST_START_POLE``.
 
         A nonlinear plant can leave the impulse response, and the fit that starts from it, with a pole at 1 that the
         plant does not have; an integrator's pole finds its way back.
         """
         tasks = [
-            FitTask(t.structure, k, LONG, begun=replace(f, model=inside(f.model)))
+            FitTask(t.structure, k, FINISHING_ITERATIONS, begun=replace(f, model=inside(f.model)))
             for t in trials[:2]
             for (k, _), f in t.fits.items()
         ]
@@ -129,7 +131,12 @@ class LinearSearch:
         """The same candidates, trained with another correction of their runs."""
         folds = range(len(self.rounds.problem.folds))
         tasks = [
-            FitTask(replace(t.structure, correction=correction), k, SHORT + LONG, start=self.start(t.structure, k))
+            FitTask(
+                replace(t.structure, correction=correction),
+                k,
+                FIRST_ROUND_ITERATIONS + FINISHING_ITERATIONS,
+                start=self.start(t.structure, k),
+            )
             for t in trials
             for k in folds
         ]
@@ -151,8 +158,8 @@ def _by_order(trials: Sequence[CandidateFits]) -> list[list[CandidateFits]]:
 
 
 def inside(model: Dynamics) -> Dynamics:
-    """The model with all its poles within ``SETTLING``."""
-    return replace(model, a=within_unit_circle(model.a, SETTLING))
+    """The model with all its poles within ``LARGEST_START_POLE``."""
+    return replace(model, a=within_unit_circle(model.a, LARGEST_START_POLE))
 
 
 def smallest_first(trials: Sequence[CandidateFits]) -> list[CandidateFits]:

@@ -12,7 +12,7 @@ from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
 from loopwright.pipeline.plants.simulator import Array
 
-LAGS = 50
+MOST_ARX_LAGS = 50
 """Most lags of the high-order ARX."""
 
 SCALES = 10.0 ** np.arange(-2.0, 6.5, 1.0)
@@ -22,7 +22,7 @@ DECAYS = np.array([0.4, 0.6, 0.75, 0.85, 0.92, 0.96, 0.98])
 DEFECTIVE = 1e10
 """Condition of the eigenvectors beyond which they do not carry a matrix."""
 
-LARGEST = 1e3
+UNSTABLE_RESPONSE = 1e3
 """Impulse response, scaled, beyond which the ARX counts as unstable."""
 
 
@@ -89,7 +89,7 @@ def _lags(data: ScaledRecord) -> int:
     """Lags that leave six rows a coefficient, and that most of the rows can spare."""
     lengths = np.array([j - i for i, j in data.bounds()])
     width = data.y.shape[1] + data.v.shape[1]
-    for n in range(min(LAGS, len(data) // (6 * width)), 2, -1):
+    for n in range(min(MOST_ARX_LAGS, len(data) // (6 * width)), 2, -1):
         if np.maximum(lengths - n, 0).sum() >= 0.6 * lengths.sum():
             return n
     raise ModelError(
@@ -145,7 +145,7 @@ class Realizations:
 
         Raises ModelError where it grows without limit.
         """
-        if not np.all(np.abs(response) < LARGEST):
+        if not np.all(np.abs(response) < UNSTABLE_RESPONSE):
             raise ModelError("the high-order ARX is unstable; record more samples or calmer operation")
         m = len(response) // 2
         weighted = response * weight

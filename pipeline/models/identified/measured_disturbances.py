@@ -9,12 +9,12 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.models.identified.scaled_record import LAGS, ScaledRecord
+from loopwright.pipeline.models.identified.scaled_record import INNOVATION_LAGS, ScaledRecord
 from loopwright.pipeline.plants.noise import levels, noise_and_change, running_levels
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 
-LATEST = 60
+LATEST_DV_ANSWER = 60
 """Most rows by which the answer to a measured disturbance is looked for."""
 
 POLES = (0.3, 0.5, 0.7, 0.8, 0.9, 0.96)
@@ -23,7 +23,7 @@ POLES = (0.3, 0.5, 0.7, 0.8, 0.9, 0.96)
 BY_CHANCE = 1.0
 """Nats by which a signal or its level may explain the outputs better than the other one does by chance."""
 
-ENOUGH = 3
+ROWS_A_NUMBER = 3
 """Rows for each number of a regression."""
 
 
@@ -95,17 +95,17 @@ def _gained(data: ScaledRecord, smoothed: ScaledRecord, j: int) -> float:
     be later.
     """
     bounds = data.bounds()
-    latest = int(min(LATEST, np.median([k - i for i, k in bounds]) // 3))
-    first = LAGS + latest
+    latest = int(min(LATEST_DV_ANSWER, np.median([k - i for i, k in bounds]) // 3))
+    first = INNOVATION_LAGS + latest
     rows = np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(i + first, k) for i, k in bounds)])
     rest = np.delete(np.hstack([data.y, data.v]), data.y.shape[1] + j, axis=1)
-    past = np.column_stack([*(rest[rows - lag] for lag in range(1, LAGS + 1)), np.ones(len(rows))])
-    if latest < 1 or len(rows) < ENOUGH * past.shape[1]:
+    past = np.column_stack([*(rest[rows - lag] for lag in range(1, INNOVATION_LAGS + 1)), np.ones(len(rows))])
+    if latest < 1 or len(rows) < ROWS_A_NUMBER * past.shape[1]:
         return 0.0
     explained, _ = np.linalg.qr(past)
     y = _without(explained, data.y[rows])
     (as_read, late), (as_level, later) = (_best(explained, y, of, rows, j, latest) for of in (data, smoothed))
-    return 0.0 if LATEST in (late, later) else len(rows) / 2 * (as_read - as_level)
+    return 0.0 if LATEST_DV_ANSWER in (late, later) else len(rows) / 2 * (as_read - as_level)
 
 
 def _best(

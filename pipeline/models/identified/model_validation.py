@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.config.known import SURE
+from loopwright.pipeline.config.known import CONTRADICTION_SDS
 from loopwright.pipeline.historian.answers import DirectModel
 from loopwright.pipeline.historian.feedback import follows
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_start import high_order_arx
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.structure import (
-    SMALL,
+    SMALL_CELL_ANSWER,
     CandidateFits,
     Cells,
     Problem,
@@ -37,11 +37,11 @@ PROVEN, UNCERTAIN, OPPOSITE, HALVES, SIZE = "proven", "uncertain", "opposite", "
 AGAINST = (OPPOSITE, HALVES)  # verdicts on a region that speak for the other sign
 TURNS, FADES = "turns", "fades"  # what holds by its regions
 CONTRARY = 2.0  # of a half of the rows, from which it speaks for the other sign
-TIMES = 3.0  # the model's answer over the one-step prediction's, or the other way round, where both are certain
+ANSWER_RATIO = 3.0  # the model's answer over the one-step prediction's, or the other way round, where both are certain
 USED = 0.25  # of a PV's strongest answer to an MV over its range: a weaker one decides nothing
-LOOKED_AT, SEEN = 60, 240  # rows after a step: of the comparison, and in which an answer begins
+COMPARED_ROWS, BEGINNING_ROWS = 60, 240  # rows after a step: of the comparison, and in which an answer begins
 LEAST_LAGS = 40  # of one-step predictions
-BEGINS, HALF, MOST = 0.02, 0.5, 0.9  # of an answer
+ANSWER_BEGUN, HALF_ANSWER, MOST_ANSWER = 0.02, 0.5, 0.9  # of an answer
 LEFT_OUT = 0.05  # of the models' weight, at either end of their answers: one poor model of many vetoes nothing
 
 
@@ -95,14 +95,19 @@ class ProvenAnswer:
 
     @property
     def _of_all(self) -> str:
-        if self.direct is None or self.sd is None or abs(self.direct) < SURE * self.sd or self.low * self.high <= 0:
+        if (
+            self.direct is None
+            or self.sd is None
+            or abs(self.direct) < CONTRADICTION_SDS * self.sd
+            or self.low * self.high <= 0
+        ):
             return UNCERTAIN
         if self.direct * self.model <= 0:
             return OPPOSITE
         if any(np.sign(self.direct) * t < -CONTRARY for t in self.halves):
             return HALVES
-        near = abs(self.model - self.direct) <= SURE * self.sd
-        return PROVEN if near or 1 / TIMES <= self.model / self.direct <= TIMES else SIZE
+        near = abs(self.model - self.direct) <= CONTRADICTION_SDS * self.sd
+        return PROVEN if near or 1 / ANSWER_RATIO <= self.model / self.direct <= ANSWER_RATIO else SIZE
 
     def times(self, unit: float, scale: float = 1.0, center: float = 0.0) -> ProvenAnswer:
         """The same in another unit; values of the MV times ``scale`` plus ``center``."""
@@ -210,8 +215,15 @@ def _regions(
             mean = of_cells[:, of] @ width[of] / width[of].sum()
             answer = _answer(mean, weights, models, columns[j] + k, first, last)
             # What the model finds small is so if one-step predictions are not certain that it is not.
-            sure = 0.0 if answer.direct is None or answer.sd is None else abs(answer.direct) - SURE * answer.sd
-            small = abs(answer.model) < SMALL * strongest and sure < TIMES * SMALL * strongest
+            sure = (
+                0.0
+                if answer.direct is None or answer.sd is None
+                else abs(answer.direct) - CONTRADICTION_SDS * answer.sd
+            )
+            small = (
+                abs(answer.model) < SMALL_CELL_ANSWER * strongest
+                and sure < ANSWER_RATIO * SMALL_CELL_ANSWER * strongest
+            )
             regions.append(Region(float(edges[of.start]), float(edges[of.stop]), bool(small), answer))
         found[j] = tuple(regions)
     return found
@@ -236,14 +248,14 @@ def _weighed(values: Array, weights: Array) -> tuple[Array, Array, Array]:
 
 
 def _place(curve: Array, late: int) -> tuple[slice, int, int]:
-    """(points of a curve, their first row, their last row) in which an answer goes from HALF to MOST of its largest.
+    """(points of a curve, first row, last row) in which an answer goes from HALF_ANSWER to MOST_ANSWER of its largest.
 
     ``late`` is the row of the first point. Rows before the first that a past MV can move count as that one.
     """
     size = np.abs(curve)
-    begins = int((size >= BEGINS * size[:SEEN].max()).argmax())
-    size = size[: max(LOOKED_AT, 2 * begins)]
-    first, last = (int((size >= share * size.max()).argmax()) for share in (HALF, MOST))
+    begins = int((size >= ANSWER_BEGUN * size[:BEGINNING_ROWS].max()).argmax())
+    size = size[: max(COMPARED_ROWS, 2 * begins)]
+    first, last = (int((size >= share * size.max()).argmax()) for share in (HALF_ANSWER, MOST_ANSWER))
     last = max(first, last)
     return slice(first, last + 1), max(first + late, 1), max(last + late, 1)
 

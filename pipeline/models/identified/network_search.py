@@ -83,7 +83,7 @@ class Rounds:
         return chosen
 
 
-SEEDS = (3, 6)
+NETWORK_SEEDS = (3, 6)
 """Fewest and most seeds of each network that reaches the last round; short records carry more of them."""
 
 QUICK_SEEDS = (2, 6)
@@ -95,13 +95,13 @@ UNITS = (4, 8, 12)
 RIDGES = (1.0, 30.0)
 """Weights of the ridge on offer: the first in the first round, all after it."""
 
-SHORT, MIDDLE, LONG = 20, 50, 120
+SHORT_ITERATIONS, MIDDLE_ITERATIONS, LONG_ITERATIONS = 20, 50, 120
 """Iterations of the first, the second and the last round."""
 
-SECOND, LAST = 6, 3
+SECOND_CANDIDATES, LAST_CANDIDATES = 6, 3
 """Candidates of the second and of the last round."""
 
-SMALL, VARIED = 3, 4
+SMALL_CARRIERS, VARIED_CARRIERS = 3, 4
 """Smallest balanced candidates that carry networks, and candidates that carry every number of units."""
 
 
@@ -117,14 +117,14 @@ class NetworkSearch:
         if not units or self.rounds.budget.left() <= 0:
             return []
         offers = _offers([t.structure for t in self.linear], units)
-        offers = self.rounds.affordable(offers, QUICK_SEEDS[0] * (BEGINNING + SHORT), 0.4)
-        cost = sum(self.rounds.budget.of(s, BEGINNING + SHORT) for s in offers)
+        offers = self.rounds.affordable(offers, QUICK_SEEDS[0] * (BEGINNING + SHORT_ITERATIONS), 0.4)
+        cost = sum(self.rounds.budget.of(s, BEGINNING + SHORT_ITERATIONS) for s in offers)
         seeds = int(np.clip(self.rounds.budget.left(0.25) / cost, *QUICK_SEEDS))
-        tasks = [self._task(s, 0, seed, SHORT) for s in offers for seed in range(seeds)]
+        tasks = [self._task(s, 0, seed, SHORT_ITERATIONS) for s in offers for seed in range(seeds)]
         quick = _ranked(self.rounds.trials(tasks, "neural networks, first training")[0])
         second = [
-            self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE, t)
-            for t in quick[:SECOND]
+            self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE_ITERATIONS, t)
+            for t in quick[:SECOND_CANDIDATES]
             for ridge in RIDGES
             for k in self._folds
         ]
@@ -134,7 +134,7 @@ class NetworkSearch:
             else []
         )
         ranked = sorted((t for t in longer if np.isfinite(t.error)), key=lambda t: t.rank) or quick
-        return self.last_round(ranked[:LAST])
+        return self.last_round(ranked[:LAST_CANDIDATES])
 
     def last_round(self, trials: Sequence[CandidateFits]) -> list[CandidateFits]:
         """Candidates over all folds and as many seeds as the budget carries, one seed of one candidate at least.
@@ -143,14 +143,16 @@ class NetworkSearch:
         """
         tasks: list[FitTask] = []
         left = self.rounds.budget.left()
-        least, most = SEEDS
+        least, most = NETWORK_SEEDS
         for place in range(most):
             for t in trials:
                 seed = [_seed(t), *(k for k in range(most) if k != _seed(t))][place]
-                left -= len(self._folds) * self.rounds.budget.of(t.structure, LONG + (0 if place == 0 else BEGINNING))
+                left -= len(self._folds) * self.rounds.budget.of(
+                    t.structure, LONG_ITERATIONS + (0 if place == 0 else BEGINNING)
+                )
                 # The seeds beyond the fewest leave half of the budget to later rounds.
                 if left >= (0 if place < least else 0.5 * self.rounds.budget.left()) or not tasks:
-                    tasks += [self._task(t.structure, k, seed, LONG, t) for k in self._folds]
+                    tasks += [self._task(t.structure, k, seed, LONG_ITERATIONS, t) for k in self._folds]
         return self.rounds.trials(tasks, "the last networks, trained to the end from several starts")[0]
 
     def corrected(self, trial: CandidateFits, correction: float) -> list[CandidateFits]:
@@ -195,11 +197,11 @@ def _offers(linear: Sequence[Structure], units: Sequence[int]) -> list[Structure
         balanced, lagged = (
             [s for s in linear if s.start == start and s.same_row is same_row] for start in ("balanced", "lagged")
         )
-        small = sorted(balanced[1:], key=lambda s: s.order)[:SMALL]
+        small = sorted(balanced[1:], key=lambda s: s.order)[:SMALL_CARRIERS]
         first += [*balanced[:1], *small[:1], *lagged[:1]]
         second += [*small[1:], *lagged[1:2]]
     bases = [*first, *second]
     middle = units[len(units) // 2]
     widest = [replace(b, n_hidden=middle, ridge=RIDGES[0]) for b in bases]
-    rest = [replace(b, n_hidden=n, ridge=RIDGES[0]) for n in units if n != middle for b in bases[:VARIED]]
+    rest = [replace(b, n_hidden=n, ridge=RIDGES[0]) for n in units if n != middle for b in bases[:VARIED_CARRIERS]]
     return [*widest, *rest]

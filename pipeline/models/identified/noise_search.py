@@ -18,7 +18,7 @@ from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.structure import CandidateFits, Problem, Structure
 from loopwright.pipeline.tuning.responses import reached
 
-ITERATIONS = 20
+LINEAR_ITERATIONS = 20
 """Iterations of a linear fit."""
 
 NATS = 5.0
@@ -34,16 +34,16 @@ ASIDE = ((1, 2), (3, 4), (6, 8), (11, 15), (20, 27), (36, 48))
 """Rows from the dead time that the impulse response shows to those on offer, round by round while they explain as much.
 """
 
-PLAIN = 3
+PLAIN_ORDERS = 3
 """The smallest orders, by which dead times are compared first."""
 
 LIKELIEST = 4
 """Dead times on offer with all orders."""
 
-LIKELY = 2.0
+LIKELY_NATS = 2.0
 """Nats up to which a dead time is as likely as the best: it is the 95 % limit of a likelihood ratio of one number."""
 
-HALF = 0.5
+HALF_RISE = 0.5
 """Share of an answer's last value at which its rise is compared with its dead time."""
 
 UNEVEN = 3.0
@@ -52,13 +52,13 @@ UNEVEN = 3.0
 SCAN_NATS = 10.0
 """Nats by which a dead time is worse, from which on no farther one is tried."""
 
-KEPT = 8
+KEPT_CANDIDATES = 8
 """Candidates of the first fold that are fitted on the others too."""
 
-LARGEST = 12
+LARGEST_ORDER = 12
 """Most states of the plant on offer: the impulse response of a record in closed loop shows no more."""
 
-UNITS_OF, SEEDS, RIDGE = 3, 3, 1.0
+UNIT_CARRIERS, SEEDS_A_NETWORK, NETWORK_RIDGE = 3, 3, 1.0
 """Linear candidates that carry networks, seeds of each, and the weight of the ridge."""
 
 FITTED: tuple[Literal["gain", "all"], ...] = ("gain", "all")
@@ -113,7 +113,7 @@ def likely_dead_times(problem: Problem, linear: Sequence[CandidateFits]) -> list
     own = [t for t in linear if t.against == least and t.structure.noise == "all" and _finite(t)]
     own = own or list(linear[:1])
     best = min(own, key=lambda t: behind(problem, t, own[0]))
-    found = [t.structure.delays for t in own if behind(problem, t, best) <= LIKELY]
+    found = [t.structure.delays for t in own if behind(problem, t, best) <= LIKELY_NATS]
     return [(min(of), max(of)) for of in zip(*found, strict=True)]
 
 
@@ -134,8 +134,8 @@ class NoiseSearch:
 
         Where dead times explain the rows alike, the best one of the middle of them goes first, see ``_along``.
         """
-        offered = [n for n in orders if n <= LARGEST]
-        scanned, middle = self._scanned(offered[:PLAIN])
+        offered = [n for n in orders if n <= LARGEST_ORDER]
+        scanned, middle = self._scanned(offered[:PLAIN_ORDERS])
         none = next(s.delays for s, _ in self.linears.starts)
         likely = dict.fromkeys([middle, *(t.structure.delays for t in scanned)])
         delays = list(dict.fromkeys([*list(likely)[:LIKELIEST], none]))
@@ -143,9 +143,9 @@ class NoiseSearch:
             Structure("balanced", n, (0, 0), d, noise=noise) for n in offered for d in delays for noise in FITTED
         ]
         known = {t.structure for t in scanned}
-        affordable = self.rounds.affordable([s for s in structures if s not in known], ITERATIONS, 0.5)
+        affordable = self.rounds.affordable([s for s in structures if s not in known], LINEAR_ITERATIONS, 0.5)
         trials, reasons = self.rounds.trials([self._task(s, 0) for s in affordable], "linear models with their noise")
-        shortlist = self.ranked([t for t in trials if np.isfinite(t.error)])[:KEPT]
+        shortlist = self.ranked([t for t in trials if np.isfinite(t.error)])[:KEPT_CANDIDATES]
         if not (shortlist or scanned):
             why = reasons[0] if reasons else "every filter over held-out rows explodes"
             raise ModelError(f"no linear model fits the record: {why}")
@@ -243,7 +243,7 @@ class NoiseSearch:
         structures = [Structure("balanced", n, (0, 0), d, noise="all") for d in delays for n in orders]
         if not structures:
             return []
-        affordable = self.rounds.affordable(structures, ITERATIONS * len(self._folds), 0.3)
+        affordable = self.rounds.affordable(structures, LINEAR_ITERATIONS * len(self._folds), 0.3)
         begun = {s.delays for s, _ in self.linears.starts}
         new = [d for d in dict.fromkeys(s.delays for s in affordable) if d not in begun]
         self.linears.starts.update(self.rounds.starts([Structure("balanced", 0, (0, 0), d) for d in new]))
@@ -252,14 +252,19 @@ class NoiseSearch:
         return [t for t in trials if len(t.fits) == len(self._folds) and _finite(t)]
 
     def _task(self, structure: Structure, fold: int) -> FitTask:
-        return FitTask(structure, fold, ITERATIONS, start=self.linears.start(structure, fold))
+        return FitTask(structure, fold, LINEAR_ITERATIONS, start=self.linears.start(structure, fold))
 
     def networks(self, linear: Sequence[CandidateFits], units: Sequence[int]) -> list[CandidateFits]:
         """Networks on the best linear candidates of the first one's dead times, from several seeds, over all folds."""
-        bases = [t for t in linear if t.structure.delays == linear[0].structure.delays][:UNITS_OF]
-        offers = [(replace(t.structure, n_hidden=n, ridge=RIDGE, noise="all"), t) for t in bases for n in units[:2]]
+        bases = [t for t in linear if t.structure.delays == linear[0].structure.delays][:UNIT_CARRIERS]
+        offers = [
+            (replace(t.structure, n_hidden=n, ridge=NETWORK_RIDGE, noise="all"), t) for t in bases for n in units[:2]
+        ]
         tasks = [
-            FitTask(s, k, TRAINED, seed, base=t.fits[k, 0]) for s, t in offers for seed in range(SEEDS) for k in t.folds
+            FitTask(s, k, TRAINED, seed, base=t.fits[k, 0])
+            for s, t in offers
+            for seed in range(SEEDS_A_NETWORK)
+            for k in t.folds
         ]
         costs = np.cumsum([self.rounds.budget.of(t.structure, t.iterations) for t in tasks])
         affordable = [t for t, cost in zip(tasks, costs, strict=True) if cost <= self.rounds.budget.left()]
@@ -307,6 +312,6 @@ def _of_lags(trial: CandidateFits, inputs: Sequence[int], n_y: int) -> float:
     for j in inputs:
         moved = curves[j, :, :n_y]
         one = moved[:, int(np.abs(moved[-1]).argmax())]
-        rise = reached(one / one[-1], HALF) if one[-1] else float(MOST_PERIODS)
+        rise = reached(one / one[-1], HALF_RISE) if one[-1] else float(MOST_PERIODS)
         shares.append(rise / (rise + trial.structure.delays[j]))
     return float(np.mean(shares))

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.linalg import lapack
 
-from loopwright.pipeline.models.identified.dynamics import EXPLODED, Dynamics, Stretch, propagate
+from loopwright.pipeline.models.identified.dynamics import EXPLODED_STATE, Dynamics, Stretch, propagate
 from loopwright.pipeline.plants.simulator import Array
 
 # ------------------------------------------ sensitivities of free runs, summed to the equations of a Gauss-Newton step
-CHUNK = 256  # rows whose sensitivities are held at a time
+SENSITIVITY_ROWS = 256  # rows whose sensitivities are held at a time
 
 
 @dataclass(slots=True, eq=False)
@@ -27,7 +27,7 @@ class Equations:
     h: Array  # (P, P)
     g: Array  # (P,)
     of_starts: list[tuple[Array, Array, Array]] = field(default_factory=list)
-    of_blocks: list[Array] = field(default_factory=list)  # (J'r, X'r) of each CHUNK rows
+    of_blocks: list[Array] = field(default_factory=list)  # (J'r, X'r) of each SENSITIVITY_ROWS rows
 
     def solve(self, damping: float, start_damping: float) -> tuple[Array, list[Array]]:
         """The step of the parameters (P,) and of each initial state (n_x,).
@@ -82,8 +82,8 @@ def sensitivity_sums(
         width = (len(free) if n_free else 0) + n_x
         s = np.zeros((n_x, width))
         s[:, -n_x:] = np.eye(n_x)
-        for first in range(0, len(stretch), CHUNK):
-            rows = slice(first, first + CHUNK)
+        for first in range(0, len(stretch), SENSITIVITY_ROWS):
+            rows = slice(first, first + SENSITIVITY_ROWS)
             z = np.concatenate([from_states[rows], stretch.v[rows]], axis=1)
             history = np.empty((len(z), n_y, width))
             t = np.tanh(z @ model.w1.T + model.b1)
@@ -106,7 +106,7 @@ def sensitivity_sums(
 
 
 # ------------------------------------------------------------------------------------------------------------- the fit
-GROWTH = 1e10  # of the damping, after which no step is looked for
+DAMPING_GROWTH = 1e10  # of the damping, after which no step is looked for
 
 
 # ---------------------------------------------------------------------- errors of free runs
@@ -178,7 +178,7 @@ def _guesses(model: Dynamics, data: Sequence[Stretch], periods: int = 100) -> li
         for _ in range(periods):
             x = model.advance(x, v)
     settled = np.hstack([first, x[:, 0, n_y:]])
-    kept = np.all(np.abs(settled) < EXPLODED, axis=1)
+    kept = np.all(np.abs(settled) < EXPLODED_STATE, axis=1)
     return [[a, b] if within else [a] for a, b, within in zip(zero, settled, kept, strict=True)]
 
 
@@ -312,7 +312,7 @@ class OutputErrorFit:
         theta = model.vector()
         now = theta[free]
         gradient = sums.g - weights * now
-        total, ceiling = loss + float(weights @ now**2), GROWTH * _scale(sums)
+        total, ceiling = loss + float(weights @ now**2), DAMPING_GROWTH * _scale(sums)
         ridged = Equations(sums.h + np.diag(weights), gradient, sums.of_starts)
         while mu < ceiling:
             try:

@@ -13,7 +13,7 @@ from loopwright.pipeline.models.identified.output_error import residuals, sensit
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.tuning.responses import reached
 
-RISES = (0.1, 0.63)
+TIME_CONSTANT_RISES = (0.1, 0.63)
 """Shares of its last value between which the time of a step response is its time constant; the first ends dead time."""
 
 GOES_ON = 0.1
@@ -22,7 +22,7 @@ GOES_ON = 0.1
 OFTEN = 0.1
 """Share of the members whose answers go on, above which all are taken so."""
 
-MIDDLE, ENOUGH = (0.159, 0.841), 8
+SD_QUANTILES, SD_MEMBERS = (0.159, 0.841), 8
 """Quantiles one standard deviation from the median of a normal sample, and members from which they are told."""
 
 MOST_COLOUR = 0.95
@@ -55,7 +55,9 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
         if len(found) < 2 or middle == 0.0:
             continue
         gain[j] = spread(found[:, -1]) / abs(middle)
-        rises = np.array([[reached(one / one[-1] if one[-1] else one, share) for share in RISES] for one in found])
+        rises = np.array(
+            [[reached(one / one[-1] if one[-1] else one, share) for share in TIME_CONSTANT_RISES] for one in found]
+        )
         taken = rises[:, 1] - rises[:, 0]
         pace[j], dead[j] = spread(taken) / max(float(np.median(taken)), 1.0), spread(rises[:, 0])
     return Doubt(gain, np.array([pace.max()]), np.array([dead.max()]))
@@ -72,9 +74,9 @@ def spread(values: Array) -> float:
     A few members far from all others say little: a drawn pole beyond 1 alone makes a gain of any size.
     """
     whole = float(values.std(ddof=1))
-    if len(values) < ENOUGH:
+    if len(values) < SD_MEMBERS:
         return whole
-    low, high = np.quantile(values, MIDDLE)
+    low, high = np.quantile(values, SD_QUANTILES)
     return min(whole, 0.5 * float(high - low))
 
 
@@ -96,10 +98,10 @@ def colour_of(residuals: Sequence[Array]) -> Array:
 
 
 # --------------------------------------------------------- models as likely as a fitted one, drawn from its covariance
-FLAT = 1e-7
+UNSEEN_EIGENVALUE = 1e-7
 """Eigenvalue of J'J, relative to the largest, below which a direction of the parameters changes no output."""
 
-WORSE = 1.3
+UNLIKELY_ERROR = 1.3
 """Free-run error over that of the fitted model above which a drawn one is no more as likely."""
 
 
@@ -133,9 +135,9 @@ def drawn(
     for cross, own, _ in sums.of_starts:
         h -= cross @ np.linalg.solve(own + 1e-9 * np.eye(len(own)), cross.T)
     values, vectors = np.linalg.eigh((h + h.T) / 2)
-    kept = values > FLAT * values[-1]
+    kept = values > UNSEEN_EIGENVALUE * values[-1]
     spread = (vectors[:, kept] / values[kept]) @ (vectors[:, kept].T @ (blocks - blocks.mean(axis=0)).T)
-    limit = WORSE**2 * sum(float(np.vdot(r, r)) for r in found)
+    limit = UNLIKELY_ERROR**2 * sum(float(np.vdot(r, r)) for r in found)
     rng = np.random.default_rng(seed)
     models = []
     for _ in range(count):

@@ -15,10 +15,10 @@ from loopwright.pipeline.plants.simulator import Array
 CURVED = 0.02
 """Share of a residual's variance beyond which curves count: a model with them would gain 1 % of its error."""
 
-SURE = 4.0
+CURVATURE_SDS = 4.0
 """Standard deviations by which the share must exceed what chance gives."""
 
-ROWS = 10
+ROWS_A_PRODUCT = 10
 """Rows for each coefficient below which products of different columns are left out."""
 
 
@@ -42,7 +42,7 @@ def curved(model: Dynamics, starts: Sequence[Array], data: Sequence[Stretch], co
     without, beside = _squares_left(straight, left), _squares_left(np.hstack([straight, bent]), left)
     # (n_y,) without what chance explains
     share = 1 - beside / (n - p - more) / np.maximum(without / (n - p), 1e-300)
-    return bool(np.any(share > max(CURVED, SURE * np.sqrt(2 * more) / n)))
+    return bool(np.any(share > max(CURVED, CURVATURE_SDS * np.sqrt(2 * more) / n)))
 
 
 def _squares_left(columns: Array, values: Array) -> Array:
@@ -56,22 +56,22 @@ def _columns(z: Array) -> tuple[Array, Array]:
     z = (z - z.mean(axis=0)) / np.maximum(z.std(axis=0), 1e-12)
     n, m = z.shape
     first, second = np.triu_indices(m)
-    if n < ROWS * (1 + 2 * m + len(first)):
+    if n < ROWS_A_PRODUCT * (1 + 2 * m + len(first)):
         first = second = np.arange(m)
     return np.column_stack([np.ones(n), z]), np.column_stack([z[:, first] * z[:, second], z**3])
 
 
 # ---------------------------------------------------------------------- a gain or a level that moves inside the record
-PARTS = (8, 16, 32, 64, 128)
+DRIFT_PARTS = (8, 16, 32, 64, 128)
 """Numbers of parts of the record that get a gain and a level of their own: drift may be slow or quick."""
 
-LEAST_ROWS = 50
+LEAST_PART_ROWS = 50
 """Fewest rows of a part."""
 
 DRIFTED = 0.5
 """Share of the residual's power, beyond the noise, that they must explain."""
 
-AS_GOOD = 0.05
+AS_GOOD_PARTS = 0.05
 """Smaller share at which longer parts still count as the best, because they leave less to chance."""
 
 MUCH = 1.5
@@ -102,7 +102,7 @@ def drift_of(model: Dynamics, data: Sequence[Stretch]) -> Drift:
     one level of the whole record, and for a run that explodes.
     """
     rows = sum(len(part.y) for part in data)
-    none = Drift(0.0, rows // PARTS[0])
+    none = Drift(0.0, rows // DRIFT_PARTS[0])
     runs = [model.free_run(x, part) for x, part in zip(fit_starts(model, data), data, strict=True)]
     if any(run is None for run in runs):
         return none
@@ -114,12 +114,12 @@ def drift_of(model: Dynamics, data: Sequence[Stretch]) -> Drift:
         power = float(np.mean(_beyond(y, predicted, len(y)) ** 2))
         if power <= MUCH**2 * floor:
             continue
-        for parts in PARTS:
-            if len(y) >= parts * LEAST_ROWS:
+        for parts in DRIFT_PARTS:
+            if len(y) >= parts * LEAST_PART_ROWS:
                 left = float(np.mean(_beyond_neighbours(y, predicted, parts) ** 2))
                 found.append(Drift(min((power - left) / (power - floor), 1.0), len(y) // parts))
     best = max(drift.share for drift in found)
-    return max((drift for drift in found if drift.share > best - AS_GOOD), key=lambda drift: drift.rows)
+    return max((drift for drift in found if drift.share > best - AS_GOOD_PARTS), key=lambda drift: drift.rows)
 
 
 def _beyond_neighbours(y: Array, predicted: Array, parts: int) -> Array:
@@ -161,7 +161,7 @@ def _line(y: Array, predicted: Array) -> tuple[float, float]:
 
 
 # ------------------------------------------------------------------ dynamics that are missing, noise that has a colour
-LAGS = 25
+RESIDUAL_LAGS = 25
 """Lags of the residual's correlations."""
 
 
@@ -176,7 +176,7 @@ def residual_figures(
     e = np.concatenate([r - r.mean(axis=0) for r in residuals])
     v = np.concatenate([u - u.mean(axis=0) for u in inputs])
     n = len(e)
-    if n <= 2 * LAGS:
+    if n <= 2 * RESIDUAL_LAGS:
         return {}
     figures = {}
     for i, name in enumerate(names):
@@ -195,7 +195,7 @@ def residual_figures(
 
 
 def _correlations(later: Array, earlier: Array) -> Array:
-    """Correlation coefficients of later(k) and earlier(k - l), l = 0 .. ``LAGS``."""
+    """Correlation coefficients of later(k) and earlier(k - l), l = 0 .. ``RESIDUAL_LAGS``."""
     norm = max(float(np.linalg.norm(later) * np.linalg.norm(earlier)), 1e-300)
     n = len(later)
-    return np.array([float(later[lag:] @ earlier[: n - lag]) for lag in range(LAGS + 1)]) / norm
+    return np.array([float(later[lag:] @ earlier[: n - lag]) for lag in range(RESIDUAL_LAGS + 1)]) / norm

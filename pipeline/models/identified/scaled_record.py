@@ -20,7 +20,7 @@ from loopwright.pipeline.records.record import Record
 HELD_OUT = 0.2
 """Share of the rows that a fold holds out: the last ones in the first fold, the first ones in the second."""
 
-SHORTEST = 12
+SHORTEST_STRETCH = 12
 """Rows of a stretch below which it is left out: its initial state alone would explain it."""
 
 
@@ -101,10 +101,12 @@ class ScaledRecord:
 
     def stretches(self) -> list[Stretch]:
         """The runs that are long enough; ModelError where none is."""
-        found = [Stretch(self.y[i:j], self.v[i:j]) for i, j in self.bounds() if j - i >= SHORTEST]
+        found = [Stretch(self.y[i:j], self.v[i:j]) for i, j in self.bounds() if j - i >= SHORTEST_STRETCH]
         if not found:
             longest = max(j - i for i, j in self.bounds())
-            raise ModelError(f"the longest run has {longest} rows; identification needs {SHORTEST}: record longer runs")
+            raise ModelError(
+                f"the longest run has {longest} rows; identification needs {SHORTEST_STRETCH}: record longer runs"
+            )
         return found
 
 
@@ -147,13 +149,13 @@ def informative(record: Record, most: int, block: int = 500) -> Record:
 
 
 # ------------------------------------------------------- the row on whose outputs an MV acts: the next one, or its own
-LAGS = 12
+INNOVATION_LAGS = 12
 """Lags of the ARX whose innovations are looked at."""
 
-AFTER = 10
+REACTION_ROWS = 10
 """Rows after an innovation in which a controller's reaction to it would show."""
 
-SURE = 5.0
+REACTION_SDS = 5.0
 """Standard deviations from zero beyond which a correlation counts."""
 
 
@@ -164,19 +166,23 @@ def may_act_in_its_row(data: ScaledRecord, n_mv: int) -> bool:
     past nor u(k) explains of y(k) goes with the later moves, u(k+1) - u(k) and after. Both parts of y(k) are residuals
     of least-squares ARX models.
     """
-    ends = [np.arange(i + LAGS, j - AFTER) for i, j in data.bounds() if j - i > LAGS + AFTER]
+    ends = [
+        np.arange(i + INNOVATION_LAGS, j - REACTION_ROWS)
+        for i, j in data.bounds()
+        if j - i > INNOVATION_LAGS + REACTION_ROWS
+    ]
     rows = np.concatenate([*ends, np.zeros(0, dtype=np.int64)])
     z, mv = np.hstack([data.y, data.v]), data.v[:, :n_mv]
-    past = np.column_stack([*(z[rows - lag] for lag in range(1, LAGS + 1)), np.ones(len(rows))])
+    past = np.column_stack([*(z[rows - lag] for lag in range(1, INNOVATION_LAGS + 1)), np.ones(len(rows))])
     if len(rows) < 3 * past.shape[1]:
         return False
-    bound = SURE / np.sqrt(len(rows))
+    bound = REACTION_SDS / np.sqrt(len(rows))
     surprise, own = _residual(past, data.y[rows]), _residual(past, mv[rows])
     if not np.any(_correlations(own, surprise) > bound):
         return False
     unexplained = _residual(np.column_stack([past, mv[rows]]), data.y[rows])
     moves = np.diff(mv, axis=0, prepend=mv[:1])
-    return not any(np.any(_correlations(moves[rows + j], unexplained) > bound) for j in range(1, AFTER + 1))
+    return not any(np.any(_correlations(moves[rows + j], unexplained) > bound) for j in range(1, REACTION_ROWS + 1))
 
 
 def _residual(columns: Array, values: Array) -> Array:

@@ -16,17 +16,17 @@ from loopwright.pipeline.plants.simulator import Array
 INTEGRATES = 0.999
 """Pole of a model beyond which it counts as one that integrates."""
 
-STEP, LONG = 1e-3, 300
+DIRECTION_STEP, DIRECTION_PERIODS = 1e-3, 300
 """Step of an input, scaled, and the periods after it, in which a model that integrates shows which way it goes."""
 
-RESTS = 200  # rows whose rests are sought
-SETTLE = 3000
+SOUGHT_RESTS = 200  # rows whose rests are sought
+MOST_REST_PERIODS = 3000
 """Rests that the map is fitted to, and the most periods in which one is reached."""
 
 STILL_WITHIN = 1e3
 """Scaled state, hidden ones included, beyond which a model has not come to rest."""
 
-FAR = 0.25
+LOADED_DEVIATION = 0.25
 """Deviation of the outputs, scaled, that loads add to the rests."""
 
 
@@ -35,7 +35,9 @@ def slowest_pole(model: Dynamics) -> float:
     return float(np.abs(np.linalg.eigvals(model.a)).max())
 
 
-def settle(model: Dynamics, v: Array, start: Array | None = None, periods: int = SETTLE) -> tuple[Array, Array]:
+def settle(
+    model: Dynamics, v: Array, start: Array | None = None, periods: int = MOST_REST_PERIODS
+) -> tuple[Array, Array]:
     """(states (n, n_x), whether each stands still (n,)) after a free run under constant inputs v (n, n_v)."""
     x = np.zeros((len(v), model.n_x)) if start is None else np.array(start)
     for _ in range(0, periods, 50):
@@ -76,16 +78,16 @@ def rest_map(model: Dynamics, y: Array, v: Array, seed: int) -> tuple[Array, Arr
     Zero, with the covariance of the data, where the model rests nowhere.
     """
     rng = np.random.default_rng(seed)
-    rows = rng.integers(len(y), size=RESTS)
+    rows = rng.integers(len(y), size=SOUGHT_RESTS)
     n_y, chosen = y.shape[1], v[rows]
     x, still = settle(model, chosen)
-    moved = FAR * rng.normal(size=(RESTS, n_y)) * (rng.random((RESTS, 1)) < 0.7)
+    moved = LOADED_DEVIATION * rng.normal(size=(SOUGHT_RESTS, n_y)) * (rng.random((SOUGHT_RESTS, 1)) < 0.7)
     at = np.where(still[:, None], x[:, :n_y] + moved, y[rows])
     found = hidden_rest(model, at, chosen, np.where(still[:, None], x, 0.0))
     good = np.all(np.isfinite(found), axis=1) & (np.abs(found).max(axis=1) < 50)
     if not good.any():  # it rests nowhere: a rest may be anywhere among the data, whose variance is 1
         return np.zeros((model.n_x, n_y + v.shape[1] + 1)), np.eye(model.n_x)
-    design = np.column_stack([at, chosen, np.ones(RESTS)])[good]
+    design = np.column_stack([at, chosen, np.ones(SOUGHT_RESTS)])[good]
     weak = 1e-6 * len(design) * np.eye(design.shape[1])
     table = np.linalg.solve(design.T @ design + weak, design.T @ found[good]).T
     error = found[good] - design @ table.T
@@ -131,19 +133,19 @@ def middle_rest(model: Dynamics, data: ScaledRecord) -> Array:
 def central_gain(model: Dynamics, data: ScaledRecord) -> tuple[Array, bool]:
     """(steady gain (n_y, n_v) under the median inputs of the data, scaled; whether the model integrates there).
 
-    Where it does, what a step of each input has moved after ``LONG`` periods stands in place of the gain.
+    Where it does, what a step of each input has moved after ``DIRECTION_PERIODS`` periods stands in place of the gain.
     """
     n_y, middle, x = data.y.shape[1], np.median(data.v, axis=0), middle_rest(model, data)
     gain, radius = steady_gain(model, x[None], middle[None])
     if radius[0] <= INTEGRATES and np.all(np.isfinite(gain)):
         return gain[0, :n_y], False
-    inputs = np.concatenate([middle + STEP * np.eye(len(middle)), middle[None]])
-    ends, _ = model.hold(np.tile(x, (len(inputs), 1)), inputs, LONG)
-    return np.asarray((ends[:-1] - ends[-1])[:, :n_y].T / STEP), True
+    inputs = np.concatenate([middle + DIRECTION_STEP * np.eye(len(middle)), middle[None]])
+    ends, _ = model.hold(np.tile(x, (len(inputs), 1)), inputs, DIRECTION_PERIODS)
+    return np.asarray((ends[:-1] - ends[-1])[:, :n_y].T / DIRECTION_STEP), True
 
 
 # --------------------------------------------------------------------- stability over the range that the record visits
-PLACES = 2000
+POLE_ROWS = 2000
 """Most visited rows at which the local poles are taken."""
 
 STABILITY_RESTS = 60
@@ -162,7 +164,7 @@ def stability_figures(model: Dynamics, states: Sequence[Array], inputs: Sequence
     the model comes to rest. ``stable`` and ``verdict`` judge by the last two, for an integrator by growth alone.
     """
     x, v = np.concatenate(list(states)), np.concatenate(list(inputs))
-    places = np.linspace(0, len(x) - 1, min(PLACES, len(x))).astype(np.int64)
+    places = np.linspace(0, len(x) - 1, min(POLE_ROWS, len(x))).astype(np.int64)
     slopes = np.broadcast_to(model.slopes(x[places], v[places])[0], (len(places), model.n_x, model.n_x))
     radius = np.abs(np.linalg.eigvals(slopes)).max(axis=1)
     growth = _growth(model, states, inputs)

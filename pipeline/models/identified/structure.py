@@ -196,8 +196,8 @@ def best_of(trials: Sequence[CandidateFits]) -> CandidateFits | None:
 
 
 EDGES = (0.05, 0.2, 0.4, 0.6, 0.8, 0.95)  # quantiles of an MV over its data between which its cells lie
-NARROW = 0.05  # of the way between the outer edges: an edge that is nearer to the one before is left out
-SMALL = 0.2  # of the largest answer of the cells: a smaller one decides nothing
+NARROW_CELL = 0.05  # of the way between the outer edges: an edge that is nearer to the one before is left out
+SMALL_CELL_ANSWER = 0.2  # of the largest answer of the cells: a smaller one decides nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -230,7 +230,7 @@ class Cells:
 
 def alike(answers: Array) -> list[slice]:
     """Neighbouring cells of one sign, or of small answers (cells,), put together; empty where all are of one kind."""
-    kinds = np.where(np.abs(answers) < SMALL * np.abs(answers).max(), 0.0, np.sign(answers))
+    kinds = np.where(np.abs(answers) < SMALL_CELL_ANSWER * np.abs(answers).max(), 0.0, np.sign(answers))
     found, first = [], 0
     for _, group in groupby(kinds):
         last = first + len(list(group))
@@ -253,7 +253,7 @@ def pieces(values: Array, knots: Sequence[float]) -> Array:
 def _edges(values: Array) -> Array:
     """Ends of the cells (2 to 6,) of an MV's values (n,)."""
     quantiles = np.quantile(values, EDGES)
-    least = NARROW * (quantiles[-1] - quantiles[0])
+    least = NARROW_CELL * (quantiles[-1] - quantiles[0])
     if least == 0:  # it rests nearly always
         return np.array([values.min(), values.max()])
     kept = [quantiles[0]]

@@ -9,7 +9,7 @@ import numpy as np
 
 from loopwright.pipeline.historian.answers import Beside, beside_record
 from loopwright.pipeline.historian.feedback import fed_back
-from loopwright.pipeline.models.identified.candidates import RESTS, misses, rests_under
+from loopwright.pipeline.models.identified.candidates import RESTING_SHARE, misses, rests_under
 from loopwright.pipeline.models.identified.knowledge import Knowledge
 from loopwright.pipeline.models.identified.linear_search import LinearSearch, smallest_first
 from loopwright.pipeline.models.identified.measured_disturbances import Disturbances
@@ -27,10 +27,10 @@ from loopwright.pipeline.models.identified.steady_states import INTEGRATES, slow
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, CandidateFits, Problem, best_of
 from loopwright.pipeline.models.part import Groundwork, Source
 
-SETTLES = 0.98
+SETTLING_POLE = 0.98
 """Slowest pole of a fold up to which it speaks for a plant that settles, where another one integrates."""
 
-NEARLY = 1.02
+STAND_IN_ERROR = 1.02
 """Relative error up to which a linear model that settles stands in for one that integrates."""
 
 CONTRADICTED = 1.25
@@ -39,13 +39,13 @@ CONTRADICTED = 1.25
 FARTHER = 2.0
 """Times the largest rest of the linear model up to which rests of a network may lie."""
 
-SLOW = 0.05
+TRIED_CORRECTION = 0.05
 """Correction of training runs that is tried where the linear model integrates, or the best network misses much."""
 
 DRIFTS = 1.5
 """Residual over noise of the best network above which the correction is tried."""
 
-GAIN = 0.01
+LEAST_NETWORK_GAIN = 0.01
 """Least relative gain of a network over the linear model, beside its spread."""
 
 WHITE = 1.01
@@ -69,10 +69,10 @@ class Selection:
 
     @property
     def nonlinear(self) -> bool:
-        """Whether the network wins by more than the standard error of its seeds' median, and by more than ``GAIN``.
+        """Whether the network wins by more than the standard error of its seeds' median, and by ``LEAST_NETWORK_GAIN``.
 
-        In a record that drifts the seeds differ by what each took for drift, so that ``GAIN`` alone decides. Noise is
-        nearly all of one-step errors, and their log-likelihood decides.
+        In a record that drifts the seeds differ by what each took for drift, so that ``LEAST_NETWORK_GAIN`` alone
+        decides. Noise is nearly all of one-step errors, and their log-likelihood decides.
         """
         if self.network is None or self.refused:
             return False
@@ -81,7 +81,7 @@ class Selection:
         if self.innovations is not None:
             return self.innovations > NETWORK_NATS
         uncertain = 0.0 if self.drifts else self.network.spread / np.sqrt(self.network.seeds)
-        return bool(self.network.error + max(uncertain, GAIN * self.linear.error) < self.linear.error)
+        return bool(self.network.error + max(uncertain, LEAST_NETWORK_GAIN * self.linear.error) < self.linear.error)
 
     @property
     def chosen(self) -> CandidateFits:
@@ -108,10 +108,10 @@ def select(
     response shows, and lagged starts unless ``lagged`` is false; where the record leaves it open, with the MVs acting
     in their own row too. Then networks on the best of them, unless its residual is white and follows no curve of its
     state and its inputs, in rounds that keep fewer and train them longer. When the budget is spent, what there is
-    decides. ``correction`` None: 0, or ``SLOW`` where the linear model integrates or the best network misses
-    much more than the noise, and the models so trained err less over held-out rows: in plain free runs, or, where the
-    plant drifts inside the record, beyond a gain and a level of each part. Raises ModelError where no candidate can be
-    fitted.
+    decides. ``correction`` None: 0, or ``TRIED_CORRECTION`` where the linear model integrates or the best network
+    misses much more than the noise, and the models so trained err less over held-out rows: in plain free runs, or,
+    where the plant drifts inside the record, beyond a gain and a level of each part. Raises ModelError where no
+    candidate can be fitted.
     """
     if rounds.problem.fed_back and correction is None:
         return by_innovations(rounds, orders, units)
@@ -121,7 +121,7 @@ def select(
     if _integrates(linear[0]):
         linear = _led_by_settling(linear, search.settling(linear))
     if correction is None and _integrates(linear[0]):
-        corrected = search.corrected(linear, SLOW)
+        corrected = search.corrected(linear, TRIED_CORRECTION)
         linear = corrected if corrected and corrected[0].rank < linear[0].rank else linear
     if may_act_in_its_row(rounds.problem.part(linear[0].structure, rounds.problem.folds[0].train), rounds.problem.n_mv):
         # Both conventions stay on offer: the networks' held-out error may decide otherwise than the linear models'.
@@ -137,14 +137,14 @@ def select(
         seen = [linear[0], best]
         if _misses(rounds.problem, best, DRIFTS):
             # Models whose training runs take their error back are not bent to follow a drift, so that they show it.
-            corrected = networks.corrected(best, SLOW)
+            corrected = networks.corrected(best, TRIED_CORRECTION)
             finalists += corrected
             seen += corrected[:1]
         drift = max((_drift(rounds.problem, trial) for trial in seen), key=lambda found: found.share)
     drifting = drift is not None and drift.found
     if drift is not None and drifting:
         # Plain free runs would rank candidates by how they follow what no model can.
-        linear = smallest_first([*linear, *search.corrected(linear[:2], SLOW)])
+        linear = smallest_first([*linear, *search.corrected(linear[:2], TRIED_CORRECTION)])
         linear = _led_by_settling(smallest_first(rounds.judged_beyond_drift(linear, drift.rows)))
         finalists = rounds.judged_beyond_drift(finalists, drift.rows)
     every, spent = [*linear, *finalists], rounds.budget.spent
@@ -181,7 +181,7 @@ def _led_by_settling(linear: list[CandidateFits], more: Sequence[CandidateFits] 
 
 def _stands_in(trial: CandidateFits, best: CandidateFits) -> bool:
     """Whether a trial settles in all folds and errs little more than the best, which integrates in one at least."""
-    most = NEARLY if min(_slowest(best, fold) for fold in best.folds) > INTEGRATES else CONTRADICTED
+    most = STAND_IN_ERROR if min(_slowest(best, fold) for fold in best.folds) > INTEGRATES else CONTRADICTED
     known = len(trial.fits) >= len(best.fits) and trial.against <= best.against
     return known and not _integrates(trial) and trial.error <= most * best.error
 
@@ -200,7 +200,7 @@ def _settling_first(problem: Problem, linear: list[CandidateFits]) -> list[Candi
         return linear
     alike = [t for t in linear if t.against == best.against and nats(problem, t, best) <= NATS]
     alike.sort(key=lambda t: t.structure.delays != best.structure.delays)
-    for limit in (SETTLES, INTEGRATES) if min(slowest) <= SETTLES else (SETTLES,):
+    for limit in (SETTLING_POLE, INTEGRATES) if min(slowest) <= SETTLING_POLE else (SETTLING_POLE,):
         settling = next((t for t in alike if all(_slowest(t, fold) <= limit for fold in t.folds)), None)
         if settling is not None:
             return [settling, *(t for t in linear if t is not settling)]
@@ -228,7 +228,7 @@ def _as_its_linear_model(problem: Problem, trial: CandidateFits) -> Problem:
     """
     n_y = problem.data.y.shape[1]
     found = [rests_under(trial.of_fold(fold)[0].model.plant, problem) for fold in trial.folds]
-    resting = [x for x, share in found if share >= RESTS]
+    resting = [x for x, share in found if share >= RESTING_SHARE]
     largest = max((float(np.abs(x[:, :n_y]).max()) for x in resting), default=0.0)
     return replace(problem, settles=bool(resting), farthest=max(problem.farthest, FARTHER * largest))
 

@@ -12,13 +12,13 @@ from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.metrics import fit_percent
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.identified import dead_periods, step_responses
-from loopwright.pipeline.models.identified.innovations import AHEAD, Innovations, ahead
+from loopwright.pipeline.models.identified.innovations import PREDICTED_AHEAD, Innovations, ahead
 from loopwright.pipeline.models.identified.output_error import fit_starts
 from loopwright.pipeline.models.identified.parameter_uncertainty import spread
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.steady_states import (
+    DIRECTION_PERIODS,
     INTEGRATES,
-    LONG,
     central_map,
     middle_rest,
     settle,
@@ -29,20 +29,20 @@ from loopwright.pipeline.models.identified.structure_search import Selection
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.manifest import Signal
 
-QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
+GAIN_PLACES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Places of an input over its data at which the local gain is taken."""
 
-LATE, BENT = 30, 1.2
+SLOPE_PERIODS, BENT_GROWTH = 30, 1.2
 """Last periods of an answer, over which the slope of an integrator's is taken, and growth that bends it too far."""
 
-SURE = 2.0
+SIGN_SDS = 2.0
 """Standard deviations from zero beyond which a gain's sign is certain."""
 
-POINTS = 60  # points kept of a step response, which is computed over twice as many samples or more
-LONGEST = 960
+RESPONSE_POINTS = 60  # points kept of a step response, which is computed over twice as many samples or more
+LONGEST_RESPONSE = 960
 """Points of a step response, and the most periods that it spans."""
 
-STEP = 0.3
+STEP_SDS = 0.3
 """Size of a step, in standard deviations of the input in the data."""
 
 
@@ -81,7 +81,7 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
         "drifts": selection.drifts,
         "noise": s.noise,
         "judged": _judged(selection),
-        "rows_ahead": None if selection.innovations is None else AHEAD,
+        "rows_ahead": None if selection.innovations is None else PREDICTED_AHEAD,
         "row_convention": f"the MVs of a row act on the outputs of the {'same' if s.same_row else 'next'} row",
         "held_out_error": chosen.error,
         "held_out_spread": chosen.spread,
@@ -105,11 +105,11 @@ def free_run_figures(
 ) -> tuple[dict[str, dict[str, Any]], dict[str, Array]]:
     """(figures of each PV, {measured, free run} (n, n_y)) of a fold's best fit over the rows that it never saw.
 
-    Runs of a model with its noise begin anew from its filter every ``AHEAD`` rows: a run over all of them would
-    hold the loads that the controller fought, and say nothing of the model.
-    ``free_run_rmse`` and the PV's own deviation ``held_sd`` in its unit, ``fit_percent``, ``rmse_by_third``: where the
-    PV was low, in the middle and high, and ``outside_training``: the share of these rows in which it left the range of
-    the training rows, where the error says nothing of the other rows.
+    Runs of a model with its noise begin anew from its filter every ``PREDICTED_AHEAD`` rows: a run over all of them
+    would hold the loads that the controller fought, and say nothing of the model. ``free_run_rmse`` and the PV's own
+    deviation ``held_sd`` in its unit, ``fit_percent``, ``rmse_by_third``: where the PV was low, in the middle and high,
+    and ``outside_training``: the share of these rows in which it left the range of the training rows, where the error
+    says nothing of the other rows.
     """
     best, problem = trial.of_fold(fold)[0], problem.in_a_loop
     held = problem.held(trial.structure, fold)
@@ -153,7 +153,7 @@ def rests_of(model: Dynamics, data: ScaledRecord) -> tuple[Array, Array]:
     places = [
         np.where(np.arange(len(middle)) == j, np.quantile(data.v[:, j], q), middle)
         for j in range(len(middle))
-        for q in QUANTILES
+        for q in GAIN_PLACES
     ]
     v = np.array(places)
     start = np.column_stack([np.zeros((len(v), data.y.shape[1])), v, np.ones(len(v))]) @ central_map(model, data).T
@@ -165,20 +165,34 @@ def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_]
     """(local steady gains (n_v, quantiles, n_y), scaled; which of them are rates; the largest spectral radius there).
 
     For an integrating output the slope of the response to a step, a period, stands in place of the gain: a rate. It is
-    taken over the last rows, of a pole beyond 1, which a record cannot tell from 1, before that bends it by ``BENT``.
+    taken over the last rows, of a pole beyond 1, which a record cannot tell from 1, before that bends it by
+    ``BENT_GROWTH``.
     """
     n_y, n_v = data.y.shape[1], data.v.shape[1]
     x, v = rests_of(model, data)
     gain, radius = steady_gain(model, x, v)
-    found, rates = np.empty((n_v, len(QUANTILES), n_y)), np.zeros((n_v, len(QUANTILES), n_y), dtype=np.bool_)
+    found, rates = np.empty((n_v, len(GAIN_PLACES), n_y)), np.zeros((n_v, len(GAIN_PLACES), n_y), dtype=np.bool_)
     for j in range(n_v):
-        for q in range(len(QUANTILES)):
-            at = j * len(QUANTILES) + q
+        for q in range(len(GAIN_PLACES)):
+            at = j * len(GAIN_PLACES) + q
             if radius[at] > INTEGRATES or not np.all(np.isfinite(gain[at])):
-                response = step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), LONG)[j, :, :n_y] / 1e-3
-                rates[j, q] = np.abs(response[-1] - response[-1 - LATE]) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
-                end = int(np.clip(np.log(BENT) / np.log(max(radius[at], 1 + 1e-9)), MOST_PERIODS, LONG)) - 1
-                found[j, q] = np.where(rates[j, q], (response[end] - response[end - LATE]) / LATE, response[-1])
+                response = (
+                    step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), DIRECTION_PERIODS)[j, :, :n_y] / 1e-3
+                )
+                rates[j, q] = (
+                    np.abs(response[-1] - response[-1 - SLOPE_PERIODS]) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
+                )
+                end = (
+                    int(
+                        np.clip(
+                            np.log(BENT_GROWTH) / np.log(max(radius[at], 1 + 1e-9)), MOST_PERIODS, DIRECTION_PERIODS
+                        )
+                    )
+                    - 1
+                )
+                found[j, q] = np.where(
+                    rates[j, q], (response[end] - response[end - SLOPE_PERIODS]) / SLOPE_PERIODS, response[-1]
+                )
             else:
                 found[j, q] = gain[at, :n_y, j]
     return found, rates, float(radius.max())
@@ -190,9 +204,9 @@ def gain_figures(
     """The steady gain [PV/input] of each PV and input, its spread over the members, its sign, its range over the data.
 
     ``gain`` is taken where all inputs are at the medians of the data; where ``rate`` is true it is in PV/input a
-    period. ``sign`` is uncertain where the gain lies within ``SURE`` spreads of zero; ``varies`` is the ratio of the
-    largest to the smallest local gain, None where the gain changes its sign. Members that settle and members that do
-    not have figures of two units: those count that are the more.
+    period. ``sign`` is uncertain where the gain lies within ``SIGN_SDS`` spreads of zero; ``varies`` is the ratio of
+    the largest to the smallest local gain, None where the gain changes its sign. Members that settle and members that
+    do not have figures of two units: those count that are the more.
     """
     found = [gains(m, data) for m in members]
     local, rates = (np.array([of[k] for of in found]) for k in (0, 1))  # (members, n_v, quantiles, n_y)
@@ -201,10 +215,10 @@ def gain_figures(
         table[pv.name] = {}
         for j, signal in enumerate(inputs):
             unit = scales.y_scale[i] / scales.v_scale[j]
-            moving = rates[:, j, len(QUANTILES) // 2, i]
+            moving = rates[:, j, len(GAIN_PLACES) // 2, i]
             rate = bool(2 * np.count_nonzero(moving) > len(members))
             of = local[moving == rate, j, :, i] * unit
-            middle = of[:, len(QUANTILES) // 2]
+            middle = of[:, len(GAIN_PLACES) // 2]
             gain, sd = float(np.median(middle)), spread(middle) if len(middle) > 1 else 0.0
             over = np.median(of, axis=0)
             turns = bool(over.min() < 0 < over.max())
@@ -212,7 +226,7 @@ def gain_figures(
                 "gain": gain,
                 "spread": sd,
                 "rate": rate,
-                "sign": "uncertain" if abs(gain) <= SURE * sd else "+" if gain > 0 else "-",
+                "sign": "uncertain" if abs(gain) <= SIGN_SDS * sd else "+" if gain > 0 else "-",
                 "low": float(over.min()),
                 "high": float(over.max()),
                 "varies": None if turns else float(np.abs(over).max() / max(np.abs(over).min(), 1e-12)),
@@ -223,15 +237,15 @@ def gain_figures(
 def response_curves(members: Sequence[Dynamics], data: ScaledRecord) -> Array:
     """Changes (members, n_v, length, n_y) of the outputs by a step of each input, scaled, until they settle.
 
-    A step of input j is ``STEP`` times its standard deviation in the data, from the rest under the medians.
+    A step of input j is ``STEP_SDS`` times its standard deviation in the data, from the rest under the medians.
     """
-    middle, size, n_y = np.median(data.v, axis=0), STEP * data.v.std(axis=0), data.y.shape[1]
-    length, rests = 2 * POINTS, [middle_rest(m, data) for m in members]
+    middle, size, n_y = np.median(data.v, axis=0), STEP_SDS * data.v.std(axis=0), data.y.shape[1]
+    length, rests = 2 * RESPONSE_POINTS, [middle_rest(m, data) for m in members]
     while True:
         runs = [step_responses(m, x, middle, size, length)[..., :n_y] for m, x in zip(members, rests, strict=True)]
         found = np.array(runs)
         late = np.abs(found[:, :, -1] - found[:, :, -length // 5]).max()
-        if length >= LONGEST or late < 0.02 * np.abs(found).max():
+        if length >= LONGEST_RESPONSE or late < 0.02 * np.abs(found).max():
             return found
         length *= 2
 
@@ -248,8 +262,8 @@ def response_figures(
 
     A response holds ``periods``, and over the members the ``middle``, ``low`` and ``high`` in PV/input.
     """
-    size, length = STEP * data.v.std(axis=0), curves.shape[2]
-    every = max(length // POINTS, 1)
+    size, length = STEP_SDS * data.v.std(axis=0), curves.shape[2]
+    every = max(length // RESPONSE_POINTS, 1)
     table: dict[str, Any] = {pv.name: {} for pv in pvs}
     for j, signal in enumerate(inputs):
         for i, pv in enumerate(pvs):

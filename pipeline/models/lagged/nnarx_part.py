@@ -14,7 +14,7 @@ from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.metrics import fit_percent, rmse
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.lagged.lagged import NNARX
-from loopwright.pipeline.models.lagged.one_step import FORGETTING, compare_one_step
+from loopwright.pipeline.models.lagged.one_step import ESTIMATE_FORGETTING, compare_one_step
 from loopwright.pipeline.models.part import Learnt, Part, Source, accuracy, predict
 from loopwright.pipeline.models.training.fit import FitHistory
 from loopwright.pipeline.models.training.network_parts import LongRun, curves, fit_figures, fit_in_two, trainer_of
@@ -22,7 +22,7 @@ from loopwright.pipeline.models.training.objectives import Samples
 from loopwright.pipeline.models.training.regressors import longest_run, nnarx_pairs, split_in_time
 from loopwright.pipeline.records.record import Record
 
-SLACK = 0.05
+SMALLER_MODEL_SLACK = 0.05
 """Relative free-run error above the best one that a smaller model may have."""
 
 
@@ -53,7 +53,7 @@ class SizeCandidate:
 Trial = tuple[NNARX, FitHistory, dict[str, LongRun], SizeCandidate]
 
 
-def parsimonious(candidates: Sequence[SizeCandidate], slack: float = SLACK) -> int:
+def parsimonious(candidates: Sequence[SizeCandidate], slack: float = SMALLER_MODEL_SLACK) -> int:
     """Index of the one with the fewest parameters among those within ``slack`` of the best free run.
 
     Differences of a few per cent between free-run errors lie within what another draw of the
@@ -97,11 +97,11 @@ class NnarxPart(Part):
     steps: int = 1
     free_run: int = 20
     search: tuple[Size, ...] = ()
-    slack: float = SLACK
+    slack: float = SMALLER_MODEL_SLACK
     long_run: int = 0
     free_run_iterations: int | None = None
     compared: int = 200
-    forgetting: tuple[float, ...] = FORGETTING
+    forgetting: tuple[float, ...] = ESTIMATE_FORGETTING
     train_fraction: float = 0.7
     trainer: Mapping[str, Any] = field(default_factory=lambda: {"kind": "lm"})
 

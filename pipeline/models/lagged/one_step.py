@@ -16,7 +16,7 @@ from loopwright.pipeline.models.training.regressors import nnarx_pairs
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 
-FORGETTING = (0.8, 0.5)  # factors of the recursive estimates
+ESTIMATE_FORGETTING = (0.8, 0.5)  # factors of the recursive estimates
 VARIANCE = 100.0
 """Variance of a recursive model's parameters at the start: an open mind, for regressors of the order of one."""
 
@@ -43,7 +43,7 @@ def compare_one_step(
     record: Record,
     *,
     target: int = 0,
-    forgetting: Sequence[float] = FORGETTING,
+    forgetting: Sequence[float] = ESTIMATE_FORGETTING,
     n_y: int | None = None,
     n_u: int | None = None,
     scaled: bool = True,

@@ -14,7 +14,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.static.least_squares import solve_qr
-from loopwright.pipeline.models.static.rbf import BASES, CHUNK, RBF, Basis, design_matrix
+from loopwright.pipeline.models.static.rbf import BASES, DESIGN_ROWS, RBF, Basis, design_matrix
 from loopwright.pipeline.plants.simulator import Array
 
 
@@ -67,7 +67,9 @@ def select_centres(u: Array, partitions: int) -> NDArray[np.int64]:
             covered[k] = True
         g, near = g[block:], near[block:]
         new = np.array(chosen[first:], dtype=np.float64).reshape(-1, g.shape[1])
-        left = [np.flatnonzero(~_covered(g[i : i + CHUNK], new, reach)) + i for i in range(0, len(g), CHUNK)]
+        left = [
+            np.flatnonzero(~_covered(g[i : i + DESIGN_ROWS], new, reach)) + i for i in range(0, len(g), DESIGN_ROWS)
+        ]
         keep = np.concatenate([np.empty(0, dtype=np.int64), *left])
         g, near = g[keep], near[keep]
         block *= 2
@@ -148,7 +150,7 @@ class FuzzyMeansRBF(RegressorMixin, BaseEstimator):
         x = torch.from_numpy(np.array(validate_data(self, X, dtype=np.float64, reset=False)))
         net = self.to_torch()
         with torch.inference_mode():
-            y = torch.cat([net(x[i : i + CHUNK]) for i in range(0, len(x), CHUNK)]).numpy()
+            y = torch.cat([net(x[i : i + DESIGN_ROWS]) for i in range(0, len(x), DESIGN_ROWS)]).numpy()
         return y[:, 0] if self._single_output else y
 
     def to_torch(self) -> RBF:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 # Rows of the sample that each stratum gives; with 8 the preconditioned condition number is about 2.5.
-SAMPLE = 8
+STRATUM_ROWS = 8
 
 
 def solve_qr(z: Tensor, y: Tensor, ridge: float = 0.0) -> Tensor:
@@ -79,13 +79,13 @@ def _gradients(
 
 
 def _sample(strata: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Rows that stand for all, up to SAMPLE of each stratum and evenly spaced in it, and their weights."""
+    """Rows that stand for all, up to STRATUM_ROWS of each stratum and evenly spaced in it, and their weights."""
     order = np.argsort(strata, kind="stable")
     count = np.bincount(strata)
     size = count[strata[order]]
     rank = np.arange(len(strata)) - np.repeat(np.cumsum(count) - count, count)
-    take = (rank * SAMPLE) // size != ((rank - 1) * SAMPLE) // size
-    return order[take], np.sqrt(size[take] / np.minimum(size[take], SAMPLE))
+    take = (rank * STRATUM_ROWS) // size != ((rank - 1) * STRATUM_ROWS) // size
+    return order[take], np.sqrt(size[take] / np.minimum(size[take], STRATUM_ROWS))
 
 
 def _r_factor(zy: Tensor, n: int, ridge: float) -> Tensor:

@@ -16,9 +16,9 @@ Basis = Literal["thin_plate", "gaussian"]
 BASES: tuple[str, ...] = get_args(Basis)
 
 # Below this a squared distance counts as zero: the spline's limit there is zero, its logarithm's is not.
-TINY = 1e-30
+ZERO_DISTANCE = 1e-30
 # Rows of a design matrix that are computed at once: large enough for both cores, small enough for a small buffer.
-CHUNK = 8192
+DESIGN_ROWS = 8192
 
 
 class RBF(Model):
@@ -54,7 +54,7 @@ class RBF(Model):
         self.n_in, self.n_centres, self.n_out, self.basis = n_in, n_centres, n_out, basis
         self.reserve(low=(n_in,), span=(n_in,), centres=(n_in, n_centres), weights=(n_out, n_centres), width=(1,))
         # A Python float would reach the graph through float32, where it is a denormal or zero.
-        self.register_buffer("tiny", torch.tensor([TINY], dtype=torch.float64), persistent=False)
+        self.register_buffer("tiny", torch.tensor([ZERO_DISTANCE], dtype=torch.float64), persistent=False)
 
     @classmethod
     def of(
@@ -98,25 +98,25 @@ def design_matrix(
 ) -> Tensor:
     """Responses h of all centres to all samples, shape (K, L), for scaled u (K, n_in) and centres (L, n_in).
 
-    ``out`` (at least K L numbers) and ``work`` (at least CHUNK L numbers) are flat buffers that a
+    ``out`` (at least K L numbers) and ``work`` (at least DESIGN_ROWS L numbers) are flat buffers that a
     caller with many fits reuses: the first touch of fresh memory costs more than the logarithms.
     """
     n_rows, n_centres = len(u), len(centres)
     out = torch.empty(n_rows * n_centres, dtype=u.dtype) if out is None else out
     z = out[: n_rows * n_centres].view(n_rows, n_centres)
     if basis == "thin_plate" and work is None:
-        work = torch.empty(min(n_rows, CHUNK) * n_centres, dtype=u.dtype)
+        work = torch.empty(min(n_rows, DESIGN_ROWS) * n_centres, dtype=u.dtype)
     # |u|^2 - 2 u c + |c|^2 as one product, written once.
     ones = torch.ones(n_rows, 1, dtype=u.dtype)
     left = torch.cat([u, (u * u).sum(1, keepdim=True), ones], dim=1)
     right = torch.cat([-2.0 * centres.T, ones[:1].expand(1, n_centres), (centres * centres).sum(1)[None]], dim=0)
-    for start in range(0, n_rows, CHUNK):
-        rows = z[start : start + CHUNK]
-        torch.mm(left[start : start + CHUNK], right, out=rows)
+    for start in range(0, n_rows, DESIGN_ROWS):
+        rows = z[start : start + DESIGN_ROWS]
+        torch.mm(left[start : start + DESIGN_ROWS], right, out=rows)
         if basis == "thin_plate":
             assert work is not None
             log = work[: rows.numel()].view(rows.shape)
-            torch.clamp(rows, min=TINY, out=log)
+            torch.clamp(rows, min=ZERO_DISTANCE, out=log)
             torch.addcmul(torch.zeros((), dtype=u.dtype), rows, log.log_(), value=0.5, out=rows)
         else:
             rows.mul_(-0.5 / width**2).exp_()

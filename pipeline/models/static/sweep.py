@@ -26,11 +26,11 @@ from loopwright.pipeline.models.static.fuzzy_means import (
     to_grid,
 )
 from loopwright.pipeline.models.static.least_squares import solve_iterative
-from loopwright.pipeline.models.static.rbf import CHUNK, Basis, design_matrix
+from loopwright.pipeline.models.static.rbf import DESIGN_ROWS, Basis, design_matrix
 from loopwright.pipeline.plants.simulator import Array
 
 Regions = Mapping[str, tuple[float, float]]
-SHARES = 12  # pieces of a sweep
+SWEEP_PIECES = 12  # pieces of a sweep
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ def sweep(
     u_train, u_val = (2.0 * (x - low) / span - 1.0 for x in (x_train, x_val))
     data = (_Half(x_train, u_train, y_train), _Half(x_val, u_val, y_val))
     # Small and large networks in each share, so that shares take about as long.
-    shares = [counts[i::SHARES] for i in range(min(SHARES, len(counts)))]
+    shares = [counts[i::SWEEP_PIECES] for i in range(min(SWEEP_PIECES, len(counts)))]
     fit = partial(_rows, data, limits=limits, regions=regions or {}, basis=basis, width=width, ridge=ridge)
     found = [row for rows in parallel_map(fit, shares, "sweep: networks of every number of partitions") for row in rows]
     rows = sorted(found, key=lambda row: row.partitions)
@@ -159,7 +159,7 @@ def _rows(
     selected = [select_centres(train.u, c) for c in counts]
     largest = max(len(index) for index in selected)
     buffer = torch.empty(max(len(train.u), len(validation.u)) * largest, dtype=torch.float64)
-    work = torch.empty(CHUNK * largest, dtype=torch.float64)
+    work = torch.empty(DESIGN_ROWS * largest, dtype=torch.float64)
     rows = list[SweepRow]()
     for c, index in zip(counts, selected, strict=True):
         centres = torch.from_numpy(grid_points(index, c))

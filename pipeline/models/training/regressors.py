@@ -12,8 +12,8 @@ from loopwright.pipeline.errors import ParamsError, RecordError
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
 
-HELD = 1e-9  # of an MV's span: what still counts as the same value
-NEAR = 0.1  # of the record's rows: how far the cut may move to come between two runs
+SAME_MV_VALUE = 1e-9  # of an MV's span: what still counts as the same value
+CUT_SHIFT = 0.1  # of the record's rows: how far the cut may move to come between two runs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +114,7 @@ def _held(record: Record, horizon: int) -> NDArray[np.int64]:
     if horizon < 1:
         raise ParamsError(f"the horizon is {horizon} periods; it must be at least 1")
     k = record.starts(horizon)
-    slack = np.array([HELD * (s.high - s.low) for s in record.mv_signals])
+    slack = np.array([SAME_MV_VALUE * (s.high - s.low) for s in record.mv_signals])
     for i in range(1, horizon):
         k = k[(np.abs(record.mv[k + i] - record.mv[k]) <= slack).all(axis=1)]
     if not k.size:
@@ -145,7 +145,7 @@ def split_in_time(record: Record, fraction: float) -> tuple[Record, Record]:
     starts = np.flatnonzero(record.run[1:] != record.run[:-1]) + 1
     if starts.size:
         nearest = int(starts[np.argmin(np.abs(starts - cut))])
-        if abs(nearest - cut) <= NEAR * n:
+        if abs(nearest - cut) <= CUT_SHIFT * n:
             cut = nearest
     if not 0 < cut < n:
         raise RecordError(

@@ -135,10 +135,10 @@ def _freed(fmu: Any, owner: int) -> None:
         fmu.freeInstance()
 
 
-LARGEST = 1 << 16  # bytes of a state that every row of a simulation holds a copy of
+LARGEST_FMU_STATE = 1 << 16  # bytes of a state that every row of a simulation holds a copy of
 SPARE = 16  # words, and an eighth of the state: some states grow with what they remember
 INSTANCES = 4  # of an FMU whose states are reached by replaying: so many branches are near at hand
-KEPT = 16  # states inside the FMU's memory
+KEPT_STATES = 16  # states inside the FMU's memory
 DIGEST = 12  # bytes of a digest of the past: two numbers of 48 bits, which a float64 holds exactly
 ROOT = bytes(DIGEST)
 
@@ -160,7 +160,7 @@ def memory_of(of: Description, folder: Path, play: Play) -> FmuMemory:
     """States as bytes where the FMU writes them and they are not too large; else by replaying what led to them."""
     first = Instance(of, folder)
     first.begin()
-    if of.writes_states and len(first.written()) <= LARGEST:
+    if of.writes_states and len(first.written()) <= LARGEST_FMU_STATE:
         return Written(of, first, play)
     more = [] if of.single or of.keeps_states else [Instance(of, folder) for _ in range(INSTANCES - 1)]
     return Replayed(of, [first, *more], play)
@@ -208,8 +208,8 @@ class Replayed:
     """A digest of all moves since the start; the FMU goes there from the nearest state before that is at hand.
 
     At hand are the start, the state that each instance is in, and, where the FMU keeps states in its own memory, the
-    last KEPT that were replayed: a state that tests went on from twice is one that more will go on from. A state is
-    known in the process that made it, and the start in every one.
+    last KEPT_STATES that were replayed: a state that tests went on from twice is one that more will go on from. A state
+    is known in the process that made it, and the start in every one.
     """
 
     def __init__(self, of: Description, instances: Sequence[Instance], play: Play) -> None:
@@ -258,7 +258,7 @@ class Replayed:
             self._moved(instance, move)
         if self._keeps and moves:
             self._kept[to] = instance.save()
-            if len(self._kept) > KEPT:
+            if len(self._kept) > KEPT_STATES:
                 instance.free(self._kept.popitem(last=False)[1])
         return instance
 

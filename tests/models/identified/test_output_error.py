@@ -14,7 +14,7 @@ from scipy import linalg
 from loopwright.pipeline.models.identified import dynamics, output_error
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.output_error import (
-    CHUNK,
+    SENSITIVITY_ROWS,
     Equations,
     OutputErrorFit,
     fit_starts,
@@ -65,7 +65,7 @@ def stretch(model: Dynamics, n_y: int, rows: int, seed: int, noise: float = 0.0)
     more=st.integers(0, 2),
     n_hidden=st.integers(0, 2),
     correction=st.sampled_from([0.0, 0.05, 1.0]),
-    rows=st.sampled_from([5, CHUNK + 7]),
+    rows=st.sampled_from([5, SENSITIVITY_ROWS + 7]),
     seed=st.integers(0, 50),
 )
 def test_the_gradient_is_that_of_the_free_run(
