@@ -23,14 +23,15 @@ class PredictiveParams:
     """Two knobs, and the numbers behind them, which follow from the model where they are None.
 
     ``speed`` > 0: 2 moves as boldly as a quarter of ``move_weight``. ``caution`` > 0: 2 follows loads as slowly
-    as a quarter of ``q_d``. ``horizon`` N samples, 8 to LONGEST_HORIZON; None: 90 % of the model's step responses
+    as a quarter of ``q_d``. ``horizon`` N samples, 8 to 500; None: 90 % of the model's step responses
     settle within it, 12 to 50. ``moves`` of each MV in a plan; None: 8 of one MV, 5 of each of several. ``move_weight``
     lambda > 0 of squared moves, mu = lambda (N - dead time)/10, MVs in units of half their range. ``eps`` > 0: errors
     smaller than this share of a PV's standard deviation count by their square, larger ones by their size. ``weights`` >
     0 of the CVs in units of their standard deviation in the record, for the stated range is often a sensor's and not
     the plant's; None: all 1. ``q_x`` and ``q_d`` > 0: variance of the model's error and of the load's change a period,
     in units of the noise's; q_d None: 3e-5 over the noise. ``jumps`` > 0: share of the observer's jump after a step of
-    a load; less calms loops over a plant that is not the model. ``loads`` act on the ``mvs`` or the ``outputs``.
+    a load; less calms loops over a plant that is not the model. ``loads`` act on the ``mvs``, where
+    there are as many as outputs, or else on the ``outputs``.
     ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or more; None: .5 of
     one MV, .25 of several, and with a search the least that the loops stand. ``tuning``: ``given`` takes these numbers,
     ``search`` starts from them and chooses speed, caution, horizon and jumps in closed loops over the model with errors

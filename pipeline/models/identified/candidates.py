@@ -95,7 +95,7 @@ class FitTask:
     begun: Fitted | None = None
 
 
-def fit(problem: Problem, task: FitTask) -> Fitted | str:
+def fit_candidate(problem: Problem, task: FitTask) -> Fitted | str:
     """The fitted candidate; the reason where the data cannot carry it.
 
     A network that explodes or swings under constant inputs, where the plant settles, counts as exploded.

@@ -17,9 +17,9 @@ from loopwright.pipeline.models.identified.innovations import Innovations, innov
 from loopwright.pipeline.models.identified.knowledge import known_figures
 from loopwright.pipeline.models.identified.model_validation import (
     ProvenAnswer,
-    answers,
     foreseen,
     proof_figures,
+    proven_answers,
     sign_margin,
     unused_answers,
 )
@@ -147,7 +147,7 @@ class IdentifiedPart(Part):
         curves = response_curves(bands, rows)
         cells = Cells.of(bands, rows, n_mv, curves.shape[2]) if structure.n_hidden else None
         size = STEP_SDS * rows.v.std(axis=0)
-        proven = answers(curves, structure, problem.data, size, n_mv, cells, weights)
+        proven = proven_answers(curves, structure, problem.data, size, n_mv, cells, weights)
         n_cv = min(len(source.signals.sp), n_y)
         controlled = {place: answer for place, answer in proven[0].items() if place[0] < n_cv}
         unused = unused_answers(controlled, np.median(curves, axis=0) / size[:, None, None], structure, (n_cv, n_mv))
@@ -213,7 +213,7 @@ def _proof(
     runs: Figures,
     noise: Array,
 ) -> dict[str, Any]:
-    """Whether the record proves the model; ``found`` of ``answers``, ``runs`` over the first fold's held-out rows.
+    """Whether the record proves the model; ``found`` of ``proven_answers``, ``runs`` over a fold's held-out rows.
 
     noise (n_y,).
     """

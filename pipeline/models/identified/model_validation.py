@@ -138,7 +138,7 @@ class Region:
     answer: ProvenAnswer
 
 
-def answers(
+def proven_answers(
     curves: Array,
     structure: Structure,
     fitted: ScaledRecord,
@@ -311,7 +311,7 @@ def proof_figures(
     free_runs: Sequence[Mapping[str, Mapping[str, Any]]],
     noise: Array,
 ) -> dict[str, Any]:
-    """``answers``: PV -> MV -> ``ProvenAnswer`` in PV/MV, with the share of the MV's moves that the PV's past explains.
+    """``proven_answers``: PV -> MV -> ``ProvenAnswer`` in PV/MV, and what of the MV the PV's past explains.
 
     ``free_run``: PV -> what the model misses over rows that its fit never saw, and how far the PV moved there, both
     beyond the ``noise`` (n_y,), in the PV's unit; of ``free_runs``, one a fold, together. ``share`` is the free run's

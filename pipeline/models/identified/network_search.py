@@ -14,7 +14,7 @@ from loopwright.pipeline.models.identified.candidates import (
     FitTask,
     FoldStart,
     find_start,
-    fit,
+    fit_candidate,
     judged_beyond_drift,
 )
 from loopwright.pipeline.models.identified.output_error import Fitted
@@ -45,7 +45,7 @@ class Rounds:
         costs = [self.budget.of(t.structure, t.iterations) for t in tasks]
         order = sorted(range(len(tasks)), key=lambda i: (-costs[i], i))
         in_order, weights = [tasks[i] for i in order], [costs[i] for i in order]
-        found = parallel_map(partial(fit, self.problem), in_order, f"{self.label}: {name}", weights)
+        found = parallel_map(partial(fit_candidate, self.problem), in_order, f"{self.label}: {name}", weights)
         outcomes: list[Fitted | str] = ["not fitted"] * len(tasks)
         for i, outcome in zip(order, found, strict=True):
             outcomes[i] = outcome

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from closed_loop_records import OperatedLoop
 
-from loopwright.pipeline.models.identified.model_validation import ProvenAnswer, Region, answers, proof_figures
+from loopwright.pipeline.models.identified.model_validation import ProvenAnswer, Region, proof_figures, proven_answers
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.structure import Structure
 
@@ -87,7 +87,7 @@ def of(loop: OperatedLoop, curve: np.ndarray, structure: Structure = PLAIN) -> P
     rows = ScaledRecord.of(record, scales)
     scaled = curve * scales.v_scale[0] / scales.y_scale[0]
     members = np.array([0.95, 1.0, 1.05])[:, None, None, None] * scaled[None, None, :, None]
-    found, surprise = answers(members, structure, rows, np.ones(1), 1)
+    found, surprise = proven_answers(members, structure, rows, np.ones(1), 1)
     assert surprise[0] * scales.y_scale[0] == pytest.approx(0.23, abs=0.05)
     table = proof_figures(found, record, scales, [{"y": {"free_run_rmse": 0.5, "held_sd": 1.3}}], np.array([0.3]))
     run = {"missed": pytest.approx(0.4), "motion": pytest.approx(np.sqrt(1.6)), "share": pytest.approx(0.5 / 1.3)}
@@ -143,7 +143,7 @@ def test_one_poor_model_of_many_vetoes_nothing(weight: float, verdict: str) -> N
     unit = scales.v_scale[0] / scales.y_scale[0]
     signs = np.r_[np.ones(9), -1.0][:, None, None, None]
     curves, weights = signs * true_curve(MOVED)[None, None, :, None] * unit, np.r_[np.ones(9), weight]
-    found, _ = answers(curves, PLAIN, ScaledRecord.of(record, scales), np.ones(1), 1, None, weights)
+    found, _ = proven_answers(curves, PLAIN, ScaledRecord.of(record, scales), np.ones(1), 1, None, weights)
     assert found[0, 0].verdict == verdict
 
 
@@ -153,5 +153,5 @@ def test_a_weak_answer_of_several_decides_nothing() -> None:
     rows = ScaledRecord.of(record, Scales.of(record, 1))
     two = ScaledRecord(rows.y, np.hstack([rows.v, rng.uniform(-1, 1, (600, 1))]), rows.run)
     curves = np.ones((2, 2, LENGTH, 1)) * np.array([1.0, 0.2])[None, :, None, None]
-    found, _ = answers(curves, Structure("balanced", 2, (0, 0), (0, 0)), two, np.ones(2), 2)
+    found, _ = proven_answers(curves, Structure("balanced", 2, (0, 0), (0, 0)), two, np.ones(2), 2)
     assert list(found) == [(0, 0)]
