@@ -60,6 +60,16 @@ def test_exception_reports_are_held_and_not_for_ever() -> None:
     assert np.isnan(short.value["u"][short.time_s == 250.0]).all()
 
 
+def test_a_move_in_the_second_half_of_a_period_counts_from_the_next_row() -> None:
+    """What is stored by exception, to the second, holds in row k as it stood at the middle of the row's period."""
+    h, t = 30.0, np.arange(0, 3600.0, 30.0)
+    for after, first in ((1.0, 10), (14.0, 10), (16.0, 11), (29.0, 11)):
+        at = np.array([0.0, 7.0, 300.0 + after, 1200.0 + after])
+        grid, _ = resampled([series("y", t, np.sin(t / 500))], [series("u", at, np.array([0.0, 0.0, 1.0, 2.0]))], h)
+        assert int(np.flatnonzero(grid.value["u"] == 1.0)[0]) == first
+        assert int(np.flatnonzero(grid.value["u"] == 2.0)[0]) == first + 30
+
+
 def test_a_grid_begins_anew_after_a_gap() -> None:
     t = np.r_[np.arange(0, 100.0, 2.0), np.arange(500.7, 600, 2.0)]
     grid, _ = resampled([series("y", t, t)], [], 2.0)

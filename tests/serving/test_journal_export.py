@@ -10,9 +10,10 @@ import pandas as pd
 import pytest
 
 from loopwright.pipeline.historian.cleaning.tags import read_tags
-from loopwright.serving import Controller, Signal
-from loopwright.serving.journal import Journal, ScanEntry, columns
+from loopwright.serving import Controller, ControlLoop, Mode, Sample, Signal
+from loopwright.serving.journal import Journal, JournalReader, ScanEntry, columns
 from loopwright.serving.station.journal_export import export, tag_table
+from loopwright.serving.station.recorder import Recorder
 
 pytest_plugins = ["small_laws"]
 
@@ -73,6 +74,35 @@ def test_an_actuator_that_does_not_follow_is_believed(tmp_path: Path, controller
     journal.close()
     export(tmp_path / "loop.journal", tmp_path / "loop.csv")
     assert pd.read_csv(tmp_path / "loop.csv")[f"{m.mv[0].name}.OP"].tolist() == [1, 2, 50]
+
+
+@pytest.mark.parametrize(("mode", "asks"), [(Mode.AUTO, True), (Mode.MANUAL, True), (Mode.SHADOW, False)])
+def test_a_scan_without_a_good_sample_has_the_mv_that_is_written_on(
+    tmp_path: Path, controller: Controller, mode: Mode, asks: bool
+) -> None:
+    """With a bad sensor no law is stepped; the loop goes on writing the MV it holds. A shadow asks for nothing."""
+    journal = Journal(tmp_path / "loop.journal")
+    recorder = Recorder(journal, lambda _: None)
+    recorder.begin(controller)
+    loop = ControlLoop(controller, sp=[1.0], mv=[40.0], mode=mode)
+    commands = []
+    for level in (0.8, np.nan, np.nan):
+        sample = Sample(pv=np.array([level, 300.0]), dv=np.array([1.5]))
+        commands.append(loop.scan(sample))
+        recorder.scan(loop, sample, commands[-1])
+    commands.append(loop.miss("the plant gives no values"))
+    recorder.scan(loop, None, commands[-1])
+    journal.close()
+    assert [c.law_mv is None for c in commands] == [False, True, True, True]
+    assert [c.writes for c in commands] == [asks] * 4
+    reader = JournalReader(tmp_path / "loop.journal")
+    at = columns(controller.manifest).index("mv valve")
+    asked = [scan.numbers[at] for _, _, scan in reader.scans()]
+    reader.close()
+    assert asked == pytest.approx([float(c.mv[0]) if asks else np.nan for c in commands], nan_ok=True)
+    export(tmp_path / "loop.journal", tmp_path / "loop.csv")
+    exported = pd.read_csv(tmp_path / "loop.csv")["valve.OP"]  # nothing reads the valve back
+    assert exported.notna().all() if asks else exported.isna().all()
 
 
 def test_the_table_of_tags_says_that_units_are_certain(tmp_path: Path, controller: Controller) -> None:

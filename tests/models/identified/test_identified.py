@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.identified.identified import Identified, noise_of
 
 
 def drawn(n_y: int = 2, n_mv: int = 1, n_dv: int = 1, n_x: int = 4, n_hidden: int = 3, seed: int = 0) -> Identified:
@@ -41,6 +41,14 @@ def test_the_equation(n_y: int, n_mv: int, n_dv: int, more: int, n_hidden: int, 
     expected += m["w2"] @ np.tanh(m["w1"] @ np.concatenate([x, scaled]) + m["b1"])
     assert model(torch.from_numpy(np.concatenate([x, v]))).numpy() == pytest.approx(expected)
     assert model.measured(torch.from_numpy(x)).numpy() == pytest.approx(x[:n_y] * m["y_scale"] + m["y_center"])
+
+
+@pytest.mark.parametrize("missed", [0.0, 2.0])
+def test_white_noise_has_its_size_under_slow_errors_of_the_model(missed: float) -> None:
+    n = 5000
+    slow = missed * np.sin(2 * np.pi * np.arange(n) / 1000)
+    runs = [(0.2 * np.random.default_rng(seed).normal(size=n) + slow)[:, None] for seed in (0, 1)]
+    assert noise_of(runs) == pytest.approx([0.2], rel=0.03)
 
 
 def test_a_batch_equals_its_rows() -> None:
