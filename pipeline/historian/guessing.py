@@ -30,10 +30,12 @@ ENDINGS: tuple[tuple[str, str], ...] = (
     (r"(^|[ ._:/-])(op|out|mv|co|valve|stellwert|y)([ ._:/-]|$)", "mv"),
     (r"(^|[ ._:/-])(pv|cv|me|meas|istwert|x)([ ._:/-]|$)", "pv"),
     # Words that mean something else elsewhere: an SV in front is a solenoid valve.
-    (r"[ ._:/-](sv|set[ _-]?(value|pt)|target|soll|consigne|consigna)$", "sp"),
+    (r"[ ._:/-](sv|sw|set[ _-]?(value|pt)|target|soll|consigne|consigna)$", "sp"),
     (r"[ ._:/-](output|lmn|stellgr(ö|oe)(ß|ss)e)$", "mv"),
-    (r"[ ._:/-]ist$", "pv"),
+    (r"[ ._:/-](ist|mw)$", "pv"),
 )
+SWITCH = re.compile(r"[ ._:/-]sw$", re.IGNORECASE)
+"""A Sollwert, or a switch where it has two values."""
 ATTRIBUTE = re.compile(
     r"([ ._:/-](?:mode|sp|sv|op|out|output|lmn|mv|co|pv))[./#](cv|f_cv|value|val|actual)$", re.IGNORECASE
 )
@@ -276,6 +278,8 @@ def _guess(series: Series, unit: str) -> Guess:
     if not series.good.any():
         return Guess(Tag(tag, "", unit), 0.0, good, Look.NOTHING)
     plain, codes, found = _plain(series, Tag(tag, role, unit))
+    if SWITCH.search(tag) and len(np.unique(plain)) <= 2:
+        role = ""
     look, notes = Look.MOVES, list[str]()
     still = np.abs(np.diff(plain)) <= 0
     if np.ptp(plain) == 0:

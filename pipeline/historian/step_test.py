@@ -70,7 +70,7 @@ class StepTest:
         lines = zip(self.start_s, self.hold_s, self.ramp_s, self.values, strict=True)
         for i, (at, hold, ramp, values) in enumerate(lines, start=1):
             clock = f"{int(at) // 3600}:{int(at) // 60 % 60:02}:{int(at) % 60:02}"
-            minutes = [f"{time_s / 60:.4g}" for time_s in ([ramp] if ramps else []) + [hold - ramp]]
+            minutes = [f"{time_s / 60 + 0.0:.4g}" for time_s in ([ramp] if ramps else []) + [hold - ramp]]
             rows.writerow([i, clock, f"{at:g}", *minutes, *(f"{v:.5g}" for v in values)])
         return out.getvalue()
 

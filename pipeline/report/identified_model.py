@@ -234,7 +234,10 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
                 continue
             curve = ((part.get("step_responses") or {}).get(signal.name) or {}).get(given.name)
             dead = (part.get("dead_times") or {}).get(given.name)
-            first = answers_after(curve, dead or 0.0) if curve else None if dead is None else dead + 1.0
+            # The points of a response may lie many periods apart; of a single output the model's dead time is exact.
+            alone = len(part.get("outputs") or ()) == 1
+            first = None if dead is None else dead + 1.0
+            first = answers_after(curve, dead or 0.0) if curve and not (alone and first) else first
             varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
             over = f"{number(found['low'])} … {number(found['high'])}, {varies}"
             rows.append(

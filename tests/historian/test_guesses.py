@@ -34,6 +34,7 @@ def tank() -> dict[str, np.ndarray]:
         "whole": np.round(valve),
         "sp": np.repeat(random.uniform(4, 6, N // 100), 100).round(1),
         "mode": np.where(np.arange(N) % 900 < 800, "AUTO", "MAN"),
+        "switch": np.where(np.arange(N) % 700 < 600, 1.0, 0.0),
         "position": np.where(np.arange(N) % 700 < 600, "Open", "Closed"),
         "two": np.where(valve > 50, 55.0, 45.0),
     }
@@ -138,6 +139,7 @@ def test_a_column_that_copies_an_mv_is_fitted(seed: int) -> None:
         (("PV.CV", "OUT.CV", "SP.CV", "MODE.ACTUAL"), ["pv", "mv", "sp", "mode"]),
         (("PV", "OP", "SP", "BA"), ["pv", "mv", "sp", "mode"]),  # its texts are modes
         (("PV.CV", "OUT.CV", "SV.CV", "BA"), ["pv", "mv", "sp", "mode"]),
+        (("MW", "Y", "SW", "BA"), ["pv", "mv", "sp", "mode"]),
     ],
 )
 def test_parts_of_a_loop_by_the_names_that_systems_give_them(
@@ -158,6 +160,12 @@ def test_parts_of_a_loop_by_the_names_that_systems_give_them(
 def test_words_that_mean_something_else_elsewhere(heads: Sequence[str], expected: list[str], tmp_path: Path) -> None:
     found = roles(tmp_path / "export.csv", dict(zip(heads, ("level", "valve", "sp", "position"), strict=False)))
     assert list(found.values()) == expected
+
+
+def test_a_switch_is_no_set_point_though_its_tag_ends_as_one(tmp_path: Path) -> None:
+    columns = {"LIC-1.MW": "level", "LIC-1.Y": "valve", "LIC-1.SW": "sp", "HS-7.SW": "switch"}
+    assert list(roles(tmp_path / "export.csv", columns).values())[:3] == ["pv", "mv", "sp"]
+    assert roles(tmp_path / "export.csv", columns)["HS-7.SW"] != "sp"
 
 
 def test_a_cv_beside_an_output_is_no_output(tmp_path: Path) -> None:

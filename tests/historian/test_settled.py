@@ -64,6 +64,8 @@ def test_loads_and_a_controller_do_not_decide_the_period_or_the_test(seed: int, 
     test = planned([replace(valve, low=0.0, high=100.0)], [50.0], PERIOD_S)
     assert 1 < test.hours < LONGEST_H
     assert max(abs(v - 50) for (v,) in test.values) * 1.2 > 2 * LOAD_SD  # the answer stands out of the load
+    slow = replace(test, ramp_s=(-0.0, *[60.0] * (len(test.hold_s) - 1)))  # the first step may change nothing
+    assert slow.table().splitlines()[1].split(",")[3] == "0"
 
 
 @pytest.mark.parametrize("drift", [0.0, 10.0])

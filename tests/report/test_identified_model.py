@@ -84,6 +84,23 @@ def test_a_linear_model_says_nothing_of_gains_over_the_range(
     assert {row[4] for row in found.answers} == over
 
 
+def test_of_a_single_output_the_models_own_dead_time_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The points of its response lie 16 periods apart: the line through them begins eight periods too late."""
+    monkeypatch.chdir(tmp_path)
+    curve = {"periods": [6, 22, 38, 54], "middle": [0.0, 0.19, 0.4, 0.48], "low": [0.0] * 4, "high": [0.1] * 4}
+    outputs = {"y0": PART["outputs"]["y0"]}
+    part = {
+        **PART,
+        "outputs": outputs,
+        "gains": {"y0": {"u0": gain("+", 1.4)}},
+        "step_responses": {"y0": {"u0": curve}},
+    }
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    assert [row[5] for row in found.answers] == ["4"]
+
+
 @pytest.mark.parametrize(("high", "lines"), [(1.0, 0), (0.4, 1)])
 def test_the_report_says_on_which_side_of_a_turn_controllers_stay(
     high: float, lines: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
