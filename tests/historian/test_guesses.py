@@ -34,7 +34,6 @@ def tank() -> dict[str, np.ndarray]:
         "whole": np.round(valve),
         "sp": np.repeat(random.uniform(4, 6, N // 100), 100).round(1),
         "mode": np.where(np.arange(N) % 900 < 800, "AUTO", "MAN"),
-        "switch": np.where(np.arange(N) % 700 < 600, 1.0, 0.0),
         "position": np.where(np.arange(N) % 700 < 600, "Open", "Closed"),
         "two": np.where(valve > 50, 55.0, 45.0),
     }
