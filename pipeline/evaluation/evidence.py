@@ -330,7 +330,7 @@ class Evidence:
             return "no other law is shipped"
         if not errors:
             return "it has the lowest gate score of the laws that did not lock up"
-        others = ", ".join(f"{n} {e:.3g}" for n, e in errors.items() if n != self.best)
+        others = ", ".join(f"{n} {e:.4g}" for n, e in errors.items() if n != self.best)
         beside = f" (others: {others})" if others else ""
         lowest = errors[self.best] <= min(self._candidates.values())
         place = (

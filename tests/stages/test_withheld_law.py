@@ -127,7 +127,7 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     (error,) = pid.development.values()
     worse = replace(pid, development=dict.fromkeys(pid.development, 2 * error))
     two = Evidence(all_cases()["it"], {}, {"pid": LawEvidence(pid, Path()), "worse": LawEvidence(worse, Path())}, {})
-    assert two.why_best.endswith(f"is the lowest: {error:.3g} m (others: worse {2 * error:.3g})")
+    assert two.why_best.endswith(f"is the lowest: {error:.4g} m (others: worse {2 * error:.4g})")
     assert "Mean absolute error in m: the median" in page
     assert re.search(r"MV travel \[[^\]]*(/min| a minute)\]", page)  # to compare with the old loop
     assert re.search(r"counts as the floor: \S+ m \(the measurement noise\)", page)
