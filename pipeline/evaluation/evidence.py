@@ -23,9 +23,9 @@ from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = Mapping[str, Mapping[str, Mapping[str, float]]]
 WITHHELD = "withheld.json"
+"""In the place of a law's metrics.json: why it was not designed for the plant."""
 # errors over the lowest one, up to which laws are as good: seeds of the data make as much of a difference
 ALIKE_ERRORS = 1.01
-"""In the place of a law's metrics.json: why it was not designed for the plant."""
 
 
 class NotMeasuredError(PipelineError):
@@ -268,7 +268,9 @@ class Evidence:
         """
         scores = self._candidates
         alike = [n for n in scores if scores[n] <= ALIKE_ERRORS * min(scores.values())]
-        return min(alike, key=lambda n: (self.laws[n].development_travel, scores[n]), default=None)
+        measured = any(self.laws[n].development is not None for n in alike)
+        travel = {n: self.laws[n].development_travel if measured else 0.0 for n in alike}
+        return min(alike, key=lambda n: (travel[n], scores[n]), default=None)
 
     @cached_property
     def _candidates(self) -> dict[str, float]:

@@ -35,9 +35,9 @@ ENDINGS: tuple[tuple[str, str], ...] = (
     (r"[ ._:/-](ist|mw)$", "pv"),
 )
 SWITCH = re.compile(r"[ ._:/-]sw$", re.IGNORECASE)
-"""A Sollwert, or a switch where it has two values."""
+"""A Sollwert; a switch where its values are 0 and 1."""
 ATTRIBUTE = re.compile(
-    r"([ ._:/-](?:mode|sp|sv|op|out|output|lmn|mv|co|pv))[./#](cv|f_cv|value|val|actual)$", re.IGNORECASE
+    r"([ ._:/-](?:mode|sp|sv|sw|op|out|output|lmn|mv|co|pv|mw))[./#](cv|f_cv|value|val|actual)$", re.IGNORECASE
 )
 """The current value of a parameter, as SP.CV and MODE.ACTUAL: the parameter's name says what it is."""
 CONTROL_VARIABLE = re.compile(r"[ ._:/-]cv$", re.IGNORECASE)
@@ -278,7 +278,7 @@ def _guess(series: Series, unit: str) -> Guess:
     if not series.good.any():
         return Guess(Tag(tag, "", unit), 0.0, good, Look.NOTHING)
     plain, codes, found = _plain(series, Tag(tag, role, unit))
-    if SWITCH.search(tag) and len(np.unique(plain)) <= 2:
+    if role == "sp" and SWITCH.search(tag) and {0.0, 1.0} >= set(np.unique(plain).tolist()):
         role = ""
     look, notes = Look.MOVES, list[str]()
     still = np.abs(np.diff(plain)) <= 0

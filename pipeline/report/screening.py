@@ -77,11 +77,11 @@ def sayings(verdict: RecordJudgement, units: Mapping[str, str], known: Collectio
             words += [hidden] if rate is not None and not gain and pv in i.against else []
             seldom = ", as it seldom rests" * (i.held_share < HELD_ROWS)
             words += [f"first answer not seen{seldom}" if first is None else _after(first, i.first_possible_s[pv])]
-            unknown = first is None and i.role == "mv" and (pv, i.name) not in said
-            words += [f'say a dead time that you know, as --known "{pv}/{i.name}=dead 30..50" in s'] if unknown else []
             words += [_settles(i, pv)] if gain else []
             words += ["gain and settling unreliable: drift or loads"] if gain and pv in verdict.unsure else []
-            lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?")
+            unknown = first is None and i.role == "mv" and (pv, i.name) not in said
+            stated = f' If you know the dead time, state it in s, as --known "{pv}/{i.name}=dead 30..50".' * unknown
+            lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?{stated}")
     return lines
 
 

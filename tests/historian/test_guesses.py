@@ -167,6 +167,13 @@ def test_a_switch_is_no_set_point_though_its_tag_ends_as_one(tmp_path: Path) -> 
     assert roles(tmp_path / "export.csv", columns)["HS-7.SW"] != "sp"
 
 
+def test_a_set_point_that_was_moved_once_or_never_is_one(tmp_path: Path) -> None:
+    columns = {"LIC-1.MW": "level", "LIC-1.Y": "valve", "LIC-1.SW": "two"}
+    assert roles(tmp_path / "two.csv", columns)["LIC-1.SW"] == "sp"
+    columns = {"LIC-1.MW.CV": "level", "LIC-1.OUT.CV": "valve", "LIC-1.SW.CV": "sp"}
+    assert list(roles(tmp_path / "attributes.csv", columns).values()) == ["pv", "mv", "sp"]
+
+
 def test_a_cv_beside_an_output_is_no_output(tmp_path: Path) -> None:
     heads = ("LIC-1.PV", "LIC-1.CV", "LV-1.OP", "LIC-1.SP")
     found = roles(tmp_path / "export.csv", dict(zip(heads, ("level", "level", "valve", "sp"), strict=True)))
