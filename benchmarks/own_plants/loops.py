@@ -86,6 +86,12 @@ def _test(
     return LoopTest(scenario, np.zeros_like(sp))
 
 
+def noise_of(plant: OwnPlant, scenario: Scenario) -> Array:
+    """The measurement noise (n, n_pv) of a test, by its seed."""
+    draws = np.random.default_rng((scenario.seed or 0) + 1).standard_normal((scenario.samples, len(plant.pv_signals)))
+    return draws * plant.noise_std
+
+
 class Steps(Protocol):
     """What closes a loop: a law, or what steps as one."""
 
@@ -104,8 +110,7 @@ def closed(laws: Steps, plant: OwnPlant, tests: list[LoopTest], count: int | Non
     scenarios = [t.scenario for t in tests]
     c, b, n = count or 1, len(tests), scenarios[0].samples
     n_pv, n_mv = len(plant.pv_signals), len(plant.mv_signals)
-    noise = np.stack([np.random.default_rng((t.seed or 0) + 1).standard_normal((n, n_pv)) for t in scenarios])
-    noise = noise * plant.noise_std
+    noise = np.stack([noise_of(plant, t) for t in scenarios])
     p = np.stack([t.parameters(plant) for t in scenarios])  # (b, n, n_p)
     advance = plant.transition.map(c * b)
     x = np.tile(np.stack([t.x0 for t in scenarios]), (c, 1))  # (c b, n_x)

@@ -18,12 +18,10 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from closed_plant import ClosedPlant
-from loops import LoopTest, Score, scores, tests_of
+from loops import LoopTest, Score, noise_of, scores, tests_of
 from plant import OwnPlant
-from store import bound_of
+from store import bound_of, nmpc_of
 
-from loopwright.pipeline.evaluation.case import Effort
-from loopwright.pipeline.optimal.perfect import PerfectNmpc
 from loopwright.pipeline.plants.simulator import Array
 
 PACES = (0.03, 0.1, 0.3, 1.0)  # of loads at the MVs [% of the valve a sample], or times what wanders really does
@@ -63,14 +61,11 @@ class Observer:
         self.z = np.concatenate([x, parameters[self.at]])
         self.cov = SMALL * np.eye(len(self.z))
         self.pushes = np.concatenate([np.full(len(x), SMALL), [m.sd**2 for m in moving]])
-        names = [
-            ca.SX.sym(name, n) for name, n in (("x", len(x)), ("u", len(plant.mv_signals)), ("p", len(parameters)))
-        ]
-        after = plant.transition(names[0], names[1], ca.DM.zeros(0, 1), names[2])
-        ways = [after, ca.jacobian(after, names[0]), ca.jacobian(after, names[2])]
-        self.advance = ca.Function("advance", names, [ca.densify(way) for way in ways])
-        seen = plant.measurement(names[0])
-        self.look = ca.Function("look", names[:1], [seen, ca.densify(ca.jacobian(seen, names[0]))])
+        state, mv, p = ca.SX.sym("x", len(x)), ca.SX.sym("u", len(plant.mv_signals)), ca.SX.sym("p", len(parameters))
+        after, seen = plant.transition(state, mv, ca.DM.zeros(0, 1), p), plant.measurement(state)
+        ways = [after, ca.jacobian(after, state), ca.jacobian(after, p)]
+        self.advance = ca.Function("advance", [state, mv, p], [ca.densify(way) for way in ways])
+        self.look = ca.Function("look", [state], [seen, ca.densify(ca.jacobian(seen, state))])
 
     def told(self, parameters: Array) -> Array:
         """The parameters (n_p,) with those that move as the filter has them."""
@@ -100,21 +95,21 @@ class Observer:
 
 def observed(plant: OwnPlant, tests: list[LoopTest], pace: float) -> Score:
     """The scores of the NMPC behind the filter, with the noise that ``loops.closed`` gives a law."""
-    nmpc = PerfectNmpc(plant, effort=Effort(periods=max(40, plant.hold // 2), elements=1, every=1))
+    nmpc, moving = nmpc_of(plant, every=1), moving_of(plant, pace)
+    measured = [m.parameter for m in plant.measured_disturbances] if isinstance(plant, ClosedPlant) else []
+    places = [plant.parameter_names().index(name) for name in measured]
     ys, us = [], []
     for test in tests:
-        scenario, nominal = test.scenario, plant.parameters()
-        true, shown = scenario.parameters(plant), plant.known(scenario)
-        noise = np.random.default_rng((scenario.seed or 0) + 1).standard_normal((scenario.samples, len(plant.noise)))
-        measured = [m.parameter for m in plant.measured_disturbances] if isinstance(plant, ClosedPlant) else []
-        given = np.tile(nominal, (scenario.samples, 1))
-        given[:, [plant.parameter_names().index(name) for name in measured]] = shown
+        scenario = test.scenario
+        true, noise = scenario.parameters(plant), noise_of(plant, scenario)
+        given = np.tile(plant.parameters(), (scenario.samples, 1))
+        given[:, places] = plant.known(scenario)
         nmpc.reset()
-        x, filtered = scenario.x0, Observer(plant, moving_of(plant, pace), scenario.x0, true[0])
+        x, filtered = scenario.x0, Observer(plant, moving, scenario.x0, true[0])
         y, u = [], []
         for k in range(scenario.samples):
             y.append(plant.measure(x) + test.upset[k])
-            filtered.see(y[-1] + noise[k] * plant.noise_std)
+            filtered.see(y[-1] + noise[k])
             u.append(nmpc.step(filtered.z[: len(x)], scenario.sp[k], filtered.told(given[k])))
             filtered.go_on(u[-1], given[k])
             x = plant.step(x, u[-1], plant.dv_nominal, true[k])

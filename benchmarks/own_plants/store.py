@@ -45,6 +45,11 @@ def model_of(plant: OwnPlant, rows: int, minutes: float | None = None) -> tuple[
     return found
 
 
+def nmpc_of(plant: OwnPlant, every: int) -> PerfectNmpc:
+    """The NMPC that knows the equations; it solves at every so many samples where nothing surprises it."""
+    return PerfectNmpc(plant, effort=Effort(periods=max(40, plant.hold // 2), elements=1, every=every))
+
+
 def bound_of(plant: OwnPlant, sequences: int | None = None) -> float:
     """Set-point nMAE [%] of the NMPC that knows the equations and the state, without noise, over so many sequences.
 
@@ -56,7 +61,7 @@ def bound_of(plant: OwnPlant, sequences: int | None = None) -> float:
     known = [inspect.getsource(type(plant)), *(t.digest() for t in tests)]
     path = FOLDER / f"{plant.name}-nmpc-{hashlib.sha256(''.join(known).encode()).hexdigest()[:12]}.pickle"
     if not path.exists():
-        nmpc = PerfectNmpc(plant, effort=Effort(periods=max(40, plant.hold // 2), elements=1, every=8))
+        nmpc = nmpc_of(plant, every=8)
         span = np.array([s.high - s.low for s in plant.sp_signals])
 
         def score(test: Scenario, pv: Array, mv: Array) -> dict[str, float]:

@@ -268,9 +268,7 @@ class Evidence:
         """
         scores = self._candidates
         alike = [n for n in scores if scores[n] <= ALIKE_ERRORS * min(scores.values())]
-        measured = any(self.laws[n].development is not None for n in alike)
-        travel = {n: self.laws[n].development_travel if measured else 0.0 for n in alike}
-        return min(alike, key=lambda n: (travel[n], scores[n]), default=None)
+        return min(alike, key=lambda n: (self.laws[n].development_travel, scores[n]), default=None)
 
     @cached_property
     def _candidates(self) -> dict[str, float]:

@@ -184,8 +184,9 @@ class LawEvidence:
 
     @property
     def development_travel(self) -> float:
-        """Median of the data seeds' travel of the MVs over the development sequences; infinite if not known."""
-        return statistics.median(self.metrics.development_travel.values() or (math.inf,))
+        """Median of the data seeds' travel of the MVs over the development sequences; infinite without an error."""
+        travels = self.metrics.development_travel.values()
+        return math.inf if not travels or self.development is None else statistics.median(travels)
 
     def form_of(self, setting: Mapping[str, Any]) -> str | None:
         """Name of the form whose numbers, words and switches are the shipped ones but for ``setting``; BASE first."""

@@ -307,8 +307,7 @@ class MinimumVariance(ControlLaw):
                 raise ValueError(f"penalty is {self.penalty}; it must be above 0")
             if self.relinearize < 1:
                 raise ValueError(f"relinearize is {self.relinearize}; give 1 or more linearizations a sample")
-            if not 0 < self.offset_filter <= 1:
-                raise ValueError(f"offset_filter is {self.offset_filter}; it must lie in (0, 1]")
+            require_share("offset_filter", self.offset_filter)
 
     unit: Tensor  # (1,) [mv]
 

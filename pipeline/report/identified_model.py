@@ -237,7 +237,8 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
             # The points of a response may lie many periods apart; of a single output the model's dead time is exact.
             alone = len(part.get("outputs") or ()) == 1
             first = None if dead is None else dead + 1.0
-            first = answers_after(curve, dead or 0.0) if curve and not (alone and first) else first
+            if curve and (first is None or not alone):
+                first = answers_after(curve, dead or 0.0)
             varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
             over = f"{number(found['low'])} … {number(found['high'])}, {varies}"
             rows.append(

@@ -5,7 +5,10 @@ from __future__ import annotations
 import ast
 import sys
 from collections import defaultdict
+from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs" / "_ext"))
@@ -18,26 +21,33 @@ SHARED = {"Controller"}
 SHARED_NUMBERS = {"DAY_S"}
 
 
-def test_no_two_public_classes_share_a_name() -> None:
+def places_of(names: Callable[[str], Iterator[str]], *, cases: bool) -> dict[str, list[str]]:
+    """Name -> the files of pipeline and serving that define it; those of papers' cases only with ``cases``."""
     found: dict[str, list[str]] = defaultdict(list)
-    for folder in ("pipeline", "serving"):
-        for file in sorted((ROOT / folder).rglob("*.py")):
-            for node in ast.parse(file.read_text(encoding="utf-8")).body:
-                if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                    found[node.name].append(str(file.relative_to(ROOT)))
-    twice = {name: files for name, files in found.items() if len(files) > 1 and name not in SHARED}
-    assert len(found) > 300
-    assert not twice
+    for file in (f for folder in ("pipeline", "serving") for f in sorted((ROOT / folder).rglob("*.py"))):
+        if cases or file.parent.parent.name != "cases":
+            for name in names(file.read_text(encoding="utf-8")):
+                found[name].append(str(file.relative_to(ROOT)))
+    return found
 
 
-def test_no_two_modules_name_a_number_alike() -> None:
-    found: dict[str, list[str]] = defaultdict(list)
-    for folder in ("pipeline", "serving"):
-        for file in sorted((ROOT / folder).rglob("*.py")):
-            if file.parent.parent.name != "cases":  # these are its paper's
-                for number in thresholds_of(file.read_text(encoding="utf-8")):
-                    found[number.name].append(str(file.relative_to(ROOT)))
-    twice = {name: files for name, files in found.items() if len(set(files)) > 1 and name not in SHARED_NUMBERS}
-    assert len(found) > 900
-    assert not twice
-    assert all(len(found[name]) > 1 for name in SHARED_NUMBERS)
+def public_classes(source: str) -> Iterator[str]:
+    nodes = ast.parse(source).body
+    return (node.name for node in nodes if isinstance(node, ast.ClassDef) and not node.name.startswith("_"))
+
+
+def numbers(source: str) -> Iterator[str]:
+    return iter({number.name for number in thresholds_of(source)})
+
+
+@pytest.mark.parametrize(
+    ("names", "cases", "least", "shared"),
+    [(public_classes, True, 300, SHARED), (numbers, False, 900, SHARED_NUMBERS)],
+    ids=["classes", "numbers"],
+)
+def test_no_two_modules_define_one_name(
+    names: Callable[[str], Iterator[str]], cases: bool, least: int, shared: set[str]
+) -> None:
+    found = places_of(names, cases=cases)
+    assert len(found) > least
+    assert {name for name, files in found.items() if len(files) > 1} == shared
