@@ -24,6 +24,7 @@ SHOWN = {
     "as_printed",
     "swings",
     "beyond_reach",
+    "calmed",
 }  # entries of the evidence that have a place of their own
 
 
@@ -40,7 +41,13 @@ def card(controller: Controller) -> str:
     if signed := signer(controller):
         lines[3:3] = [f"  signed    by {signed.words}", *(f"            {words}" for words in ending(controller))]
     first = _locked_up(m.evidence) or [f"  NOT PROVEN: {why}" for why in filter(None, [judged(m).why])]
-    lines[1:1] = [*first, *_swings(m.evidence), *_beyond_reach(m.evidence), *_doubtful(m.evidence)]
+    lines[1:1] = [
+        *first,
+        *_swings(m.evidence),
+        *_beyond_reach(m.evidence),
+        *_calmed(m.evidence),
+        *_doubtful(m.evidence),
+    ]
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
         idle = " (this law does not take them)" * (name == "dv" and "dv" not in m.inputs)
         lines += _signals(title + idle, m.signals(name))
@@ -96,6 +103,12 @@ def _beyond_reach(evidence: dict[str, Any]) -> list[str]:
     if not isinstance(tests, dict) or not tests:
         return []
     return ["  holds at an end of the MVs whose set point no control gets to in time, no lock-ups", *_by_test(tests)]
+
+
+def _calmed(evidence: dict[str, Any]) -> list[str]:
+    """Why the numbers are calmer than those that the tuning found; nothing where they are these."""
+    why = evidence.get("calmed")
+    return [f"  calmer numbers than the tuning found, with which it {why}"] if isinstance(why, str) and why else []
 
 
 def _swings(evidence: dict[str, Any]) -> list[str]:

@@ -92,7 +92,8 @@ class LawMetrics:
     ``at_rest``: test -> the error with the MVs left where they stand, of a case on models; ``cycles``: test -> the
     worst limit cycle of the shipped file; ``poor``: why a law that locked up nowhere is not shipped, a clause after its
     name, and what to do; ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to
-    their set point.
+    their set point; ``calmed``: why the law's own numbers are not shipped, a clause after
+    its name, where calmer ones hold; all figures are then of these.
     """
 
     name: str
@@ -115,6 +116,14 @@ class LawMetrics:
     cycles: Mapping[str, Cycle] = field(default_factory=dict)
     poor: str = ""
     beyond_reach: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    calmed: str = ""
+
+    @property
+    def why_withheld(self) -> str:
+        """Why the law is not shipped, a clause after its name; empty where it is."""
+        if self.lock_ups > 0 and not self.as_printed:
+            return f"locked up or left its limits on {lock_up_text(self.locked_up)}"
+        return self.poor
 
     def write(self, path: Path) -> None:
         """Write the file; ValueError for NaN and infinity."""
@@ -169,9 +178,7 @@ class LawEvidence:
     @property
     def why_withheld(self) -> str:
         """Why it is not shipped, a clause after its name; empty where it is."""
-        if self.lock_ups > 0 and not self.metrics.as_printed:
-            return f"locked up or left its limits on {lock_up_text(self.metrics.locked_up)}"
-        return self.metrics.poor
+        return self.metrics.why_withheld
 
     @property
     def development(self) -> float | None:

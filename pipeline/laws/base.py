@@ -155,6 +155,10 @@ class ControlLaw(nn.Module, ABC):
         """The law's results without closed-loop tests on ``plant``; empty by default."""
         return Analysis()
 
+    def calmed(self) -> Self | None:
+        """The law with calmer numbers, for a plant on which its own do not hold; None: it has none."""
+        return None
+
     def limited(self, mv: Tensor, mv_applied: Tensor) -> Tensor:
         """The MV limited to ``rate`` around the applied MV, if a rate is set, and then to the range.
 

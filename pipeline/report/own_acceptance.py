@@ -88,6 +88,8 @@ def against(evidence: Evidence) -> list[dict[str, str]]:
             worst = worst_cycle(evidence, law)
             most = f": at worst {evidence.laws[law].metrics.cycles[worst].words} in {worst}" if worst else ""
             clauses.append(f"swings to the end in {lock_up_text(swings)}{most}")
+        if why := evidence.laws[law].metrics.calmed:
+            clauses.append(f"has calmer numbers than its tuning found, with which it {why}")
         if clauses:
             rows.append({"law": law, "words": "; it ".join(clauses)})
     return rows

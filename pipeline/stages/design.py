@@ -30,7 +30,14 @@ from loopwright.pipeline.laws.suitability import require_fit
 from loopwright.pipeline.models import load_model
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.simulator import Array, Simulator
-from loopwright.pipeline.stages.paths import analysis_file, controller_file, design_folder, model_folder, old_loop_file
+from loopwright.pipeline.stages.paths import (
+    analysis_file,
+    calm_file,
+    controller_file,
+    design_folder,
+    model_folder,
+    old_loop_file,
+)
 
 REFUSALS = (PipelineError, np.linalg.LinAlgError)
 """Errors of a law that a plant does not suit; any other error is a mistake in the program."""
@@ -155,17 +162,27 @@ def _export(
         law = LAWS[params.law].design(forms[form], parts, plant.signals, plant).eval()
         export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
         row = {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
-        return row | _analysed(law, plant, analysis_file(params.case, params.name, form, seed))
+        row |= _analysed(law, plant, analysis_file(params.case, params.name, form, seed))
+        if withhold and form == BASE and (calm := law.calmed()) is not None:
+            export(
+                calm.eval(),
+                calm_file(params.case, params.name, seed),
+                case=params.case,
+                provenance=origin,
+                drive=_closed_loop(plant),
+            )
+            row |= {"calmed": _analysed(calm, plant, None)}
+        return row
     except REFUSALS as error:
         if not withhold:
             raise  # who wrote equations and a law down wants to know
         raise WithheldError(_why(params.law, error)) from error
 
 
-def _analysed(law: ControlLaw, plant: Simulator, path: Path) -> dict[str, Any]:
-    """The law's own analysis, its arrays in a file of their own; nothing of a law that has none."""
+def _analysed(law: ControlLaw, plant: Simulator, path: Path | None) -> dict[str, Any]:
+    """The law's own analysis, its arrays in a file of their own if there is to be one; {} of a law that has none."""
     analysis = law.analysis(plant)
-    if analysis.arrays:
+    if analysis.arrays and path is not None:
         arrays: dict[str, Any] = {name: np.asarray(array) for name, array in analysis.arrays.items()}
         np.savez_compressed(path, **arrays)
     words: dict[str, Any] = {"figures": _floats(analysis.figures), "notes": list(analysis.notes)}

@@ -39,6 +39,11 @@ def old_loop_file(case: str, name: str, seed: int) -> Path:
     return controller_file(case, name, "before", seed)
 
 
+def calm_file(case: str, name: str, seed: int) -> Path:
+    """The law with calmer numbers, beside an own plant's controller: shipped where that one does not hold."""
+    return controller_file(case, name, "calm", seed)
+
+
 def analysis_file(case: str, name: str, form: str, seed: int) -> Path:
     """The arrays of a form's analysis, beside its exported file; there only where the law has some."""
     return controller_file(case, name, form, seed).with_suffix(".analysis.npz")

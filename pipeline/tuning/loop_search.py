@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from math import copysign, isfinite
 
 import numpy as np
 
@@ -35,6 +36,11 @@ FINE_WEIGHTS = (
     1.0,
 )  # set-point weights tried for each loop by itself, last in a round
 
+# of a PI of last resort; half the gain is a gain margin twice the tuned loop's, and twice the plant's gain has a test
+CALM_GAIN = 0.5
+CALM_LAGS = 1.0  # time constants: as slow as the plant by itself, which no error of the model makes swing
+CALM_DEAD_TIMES = 4.0  # dead times and periods: four times what a tight loop has
+
 
 def simc(process: FirstOrder, period_s: float, tau_c_s: float) -> PidSettings:
     """The PI for a lag or an integrator with dead time, the sampling counted as half a period of dead time.
@@ -45,6 +51,23 @@ def simc(process: FirstOrder, period_s: float, tau_c_s: float) -> PidSettings:
     """
     closed = tau_c_s + process.dead_time_s + period_s / 2
     return PidSettings(1 / (process.rate * closed), min(process.tau_s, 4 * closed))
+
+
+def calm(processes: Sequence[FirstOrder], period_s: float, tuned: Loops) -> Loops:
+    """A PI for each loop, of half the tuned gain at most, and no faster than the plant itself: the last resort.
+
+    A lag is controlled with a closed-loop time constant of ``CALM_LAGS`` of its own, and each process of at least
+    ``CALM_DEAD_TIMES`` dead times and periods. Integral times are no shorter than the tuned ones. The tuned set-point
+    weights and tracking times stay.
+    """
+    found = []
+    for process, now in zip(processes, tuned, strict=True):
+        slow = CALM_DEAD_TIMES * (process.dead_time_s + period_s)
+        pi = simc(process, period_s, max(slow, CALM_LAGS * process.tau_s) if isfinite(process.tau_s) else slow)
+        gain = min(abs(pi.kc), CALM_GAIN * abs(now.kc))
+        calmer = replace(now, kc=copysign(gain, now.kc), ti_s=max(pi.ti_s, now.ti_s), td_s=0.0, filter_s=0.0)
+        found.append(calmer)
+    return tuple(found)
 
 
 def searched(

@@ -634,6 +634,19 @@ def test_a_searched_law_costs_no_more_than_the_given_one() -> None:
     assert not law_of(first_order()).analysis(None).figures
 
 
+def test_the_calmer_law_of_a_search_moves_less_and_has_the_same_signals() -> None:
+    params = Predictive.Params(tuning="search", horizon=8, moves=3, passes=1, sweeps=2, speed=2.0)
+    model = first_order(pole=0.5)
+    law = Predictive.design(params, {"identified": model}, made_signals(), None)
+    calm = law.calmed()
+    assert calm is not None
+    assert (calm.n_state, calm.info, calm.moves.horizon) == (law.n_state, law.info, law.moves.horizon)
+    plant, sp = first_order(pole=0.5, gain=3.5), np.full((40, 1), 0.8)
+    travels = [np.abs(np.diff(closed(one, plant, sp)[1], axis=0, prepend=0.0)).sum() for one in (law, calm)]
+    assert travels[1] < 0.7 * travels[0]
+    assert law_of(first_order()).calmed() is None
+
+
 def test_plants_of_the_trials_err_as_far_as_the_record_leaves_open_and_no_less_than_plants_change() -> None:
     model, signals = first_order(), made_signals()
     certain = TuningLoops.draw(model, signals, 12, seed=0)

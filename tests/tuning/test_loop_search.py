@@ -15,7 +15,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.tuning.development import DevelopmentLoops
-from loopwright.pipeline.tuning.loop_search import searched, simc
+from loopwright.pipeline.tuning.loop_search import CALM_GAIN, calm, searched, simc
 from loopwright.pipeline.tuning.pairing import pairings, relative_gains
 from loopwright.pipeline.tuning.responses import FirstOrder, StepResponses
 from loopwright.pipeline.tuning.rules import PidSettings
@@ -315,3 +315,27 @@ def test_loads_act_with_the_mvs_alone() -> None:
     assert not loops.load[:, 0].any()
     assert set(np.unique(loops.load[:, 1])) <= {-0.16, 0.0, 0.16}
     assert np.all(np.abs(loops.sp[:, 0]) <= 3.0)
+
+
+@given(st.sampled_from([1.0, -1.0]), st.floats(0.0, 40.0), st.floats(4.0, 400.0) | st.just(inf), st.floats(0.1, 8.0))
+def test_a_calm_pi_holds_a_plant_of_twice_the_gain_and_twice_the_dead_time(
+    sign: float, dead_s: float, tau_s: float, boldness: float
+) -> None:
+    h, rate = 2.0, 0.03 * sign
+    process = FirstOrder(rate, tau_s, dead_s)
+    bold = simc(process, h, (dead_s + h) / boldness)
+    (found,) = calm([process], h, (bold,))
+    assert abs(found.kc) <= CALM_GAIN * abs(bold.kc) * (1 + 1e-12)
+    assert found.kc * bold.kc > 0
+    assert found.ti_s >= bold.ti_s
+    assert (found.td_s, found.filter_s, found.set_point_weight) == (0.0, 0.0, bold.set_point_weight)
+    pole = 1.0 if tau_s == inf else float(np.exp(-h / tau_s))
+    gain, late = 2 * rate * (h if tau_s == inf else tau_s * (1 - pole)), round(2 * dead_s / h)
+    y, u, past, before = 1.0, 0.0, [0.0] * (late + 1), 1.0
+    sizes = []
+    for _ in range(int(40 * (dead_s + h + found.ti_s) / h)):
+        u += found.kc * (before - y - h / found.ti_s * y)
+        before, past = y, [u, *past[:late]]
+        y = pole * y + gain * past[late]
+        sizes.append(abs(y))
+    assert max(sizes[-len(sizes) // 4 :]) < 0.05 * max(sizes)

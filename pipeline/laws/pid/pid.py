@@ -133,6 +133,8 @@ class PID(ControlLaw):
     examined_cv: tuple[float, float] | None = None
     pairings: tuple[TunedPairing, ...] = ()  # of several loops, those that were tuned; the first is this law's
     pairs_given: bool = False
+    calm: Loops | None = None  # settings of last resort, of a search
+    mv_rate: Rates = None
 
     def __init__(
         self,
@@ -181,6 +183,7 @@ class PID(ControlLaw):
         found = tuned(params, models, signals, plant, partial(cls, signals, mv_rate=params.mv_rate))
         law = cls(signals, found.settings, params.mv_rate, found.pairs)
         law.examined_cv, law.pairings, law.pairs_given = params.examined_cv, found.pairings, params.pairs is not None
+        law.calm, law.mv_rate = found.calm, params.mv_rate
         return law
 
     @classmethod
@@ -231,6 +234,10 @@ class PID(ControlLaw):
         mv = self.limited(asked, mv_applied)
         started = torch.ones_like(p[..., :1])
         return mv, torch.cat([started, p, y, d, requested, _of(mv, self.mvs), applied], dim=-1), requested
+
+    def calmed(self) -> Self | None:
+        """A slow PI on the same pairs, see ``calm`` of tuning/loop_search.py; None without a search."""
+        return None if self.calm is None else type(self)(self.signals, self.calm, self.mv_rate, self.pairs)
 
     def analysis(self, plant: Simulator | None) -> Analysis:
         """The settings in words; stability and gain margin over ``examined_cv``; the pairs of several loops."""

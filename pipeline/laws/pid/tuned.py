@@ -16,7 +16,7 @@ from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning import rules
 from loopwright.pipeline.tuning.development import DevelopmentLoops
-from loopwright.pipeline.tuning.loop_search import Loops, searched
+from loopwright.pipeline.tuning.loop_search import Loops, calm, searched
 from loopwright.pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, gains_of, pairings
 from loopwright.pipeline.tuning.reduction import LagWithDeadTime, start_lags
 from loopwright.pipeline.tuning.responses import StepResponses
@@ -32,12 +32,13 @@ DEVELOPMENT_HOLDS = (60, 400)  # least and most
 class TunedLoops:
     """Settings of one loop, or of the loop of each pair; of several loops also the pairings that were tuned.
 
-    The first of ``pairings`` is that of ``pairs``.
+    The first of ``pairings`` is that of ``pairs``. ``calm`` stands for plants on which ``settings`` do not hold.
     """
 
     settings: PidSettings | Loops
     pairs: Pairs = ONE_LOOP
     pairings: tuple[TunedPairing, ...] = ()
+    calm: Loops | None = None  # of a search: settings of last resort
 
 
 class LawOf(Protocol):
@@ -153,7 +154,8 @@ def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) ->
     # The first of equal ones: sorting keeps their order.
     found.sort(key=lambda row: row[0])
     _, settings, best = found[0]
-    return TunedLoops(settings, best.pairs, tuple(row[2] for row in found) if len(best.pairs) > 1 else ())
+    last = calm([responses.process(*pair) for pair in best.pairs], signals.period_s, settings)
+    return TunedLoops(settings, best.pairs, tuple(row[2] for row in found) if len(best.pairs) > 1 else (), last)
 
 
 def by_simulation(params: Any, plant: Simulator) -> bool:

@@ -31,6 +31,10 @@ from loopwright.pipeline.models.memory import AffineMap, Named
 from loopwright.pipeline.plants.noise import level_gain
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 
+# Of the searched numbers, for a plant on which they do not hold:
+CALM_SPEED = 0.3  # moves weigh eleven times as much
+CALM_JUMPS = 0.1  # the observer takes a swing of its own loop for steps of a load less
+
 
 class Predictive(ControlLaw):
     """Model predictive control of several variables by several, free of offset.
@@ -59,6 +63,7 @@ class Predictive(ControlLaw):
     Params: ClassVar[type[Any]] = PredictiveParams
 
     tried: tuple[TriedNumbers, ...] = ()  # of a search, the numbers that it started from first
+    calmer: tuple[Identified, PredictiveParams] | None = None  # of a search: model and numbers of last resort
     remarks: tuple[str, ...] = ()  # on a horizon that is short for the model
     shift: Tensor  # (m, m) of a plan to the next sample
     upper: Tensor  # where the flat covariance's upper half stands
@@ -209,7 +214,23 @@ class Predictive(ControlLaw):
         found = tuned(TuningLoops.draw(model, self.signals, horizon, params.seed), law_of, start, params.damping)
         law: Self = law_of(found.numbers, found.damping, params)
         law.tried = found.tried
+        at = found.numbers
+        law.calmer = (
+            model,
+            replace(
+                params,
+                speed=CALM_SPEED * at["speed"],
+                caution=at["caution"],
+                jumps=CALM_JUMPS * at["jumps"],
+                horizon=int(at["horizon"]),
+                damping=found.damping,
+            ),
+        )
         return law
+
+    def calmed(self) -> Self | None:
+        """The law of ``CALM_SPEED`` of the speed and ``CALM_JUMPS`` of the jumps; None without a search."""
+        return None if self.calmer is None else type(self)(self.signals, *self.calmer)
 
     def analysis(self, plant: Simulator | None) -> Analysis:
         """The numbers that a search chose, and its cost at first and at last; nothing else without one."""
