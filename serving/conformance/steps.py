@@ -1,9 +1,9 @@
-"""Steps of a controller for a host to repeat: a chain of 300, cold starts, and inputs to refuse."""
+"""Steps of a controller for a host to repeat: from the states of a chain of 300, cold, and with inputs to refuse."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from dataclasses import dataclass, replace
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass
 from math import inf, nan
 from typing import TypeAlias
 
@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 
 from loopwright.serving.controller import Controller, Step
 from loopwright.serving.errors import OutputError, SampleError
-from loopwright.serving.manifest import SENSITIVE, Manifest, Signal
+from loopwright.serving.manifest import Manifest, Signal
 
 Array: TypeAlias = NDArray[np.float64]
+
+OUTPUTS = ("mv", "state_next", "info")
 
 COURSE_STEP = 0.03  # share of a range that an input moves at most from step to step while it follows a course
 COLD_STARTS = 10  # cold starts that a host repeats, each with two steps after it
 STEP_DRAWS = 40  # tried for a step whose MV lies inside its range
+NUDGE = 1e-12  # share of an entry of the state by which a run beside the chain is off: far above rounding's 2e-16
 AT_AN_END = 0.1  # share of the values drawn anywhere that lie at an end of the range
 
 
@@ -33,49 +36,75 @@ class StepInputs:
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """The result of one step; where it is refused, ``refused`` says because of the input or of the output."""
+    """The result of one step from ``state`` (n_state,); a step that is refused says why: input or output."""
 
     given: StepInputs
+    state: Array
     step: Step | None
     refused: str = ""
 
 
 def answered(controller: Controller) -> list[StepResult]:
-    """All steps of the kit, as this runtime answers them; a refused step leaves the state as it was.
-
-    A law that amplifies rounding starts from zeros again long before two right hosts part.
-    """
+    """All steps of the kit, as this runtime answers them; a refused step leaves the state as it was."""
     state, last, answers = controller.cold_state(), _middle(controller.manifest.mv), []
-    parts_after = controller.manifest.provenance.get(SENSITIVE)
-    longest = max(int(parts_after) // 4, 1) if isinstance(parts_after, int) else None
-    since = 0
     drawn = _drawn(controller.manifest)
     choices = next(drawn)
     while True:
-        again = longest is not None and since >= longest
-        for choice in choices:
-            given = replace(choice, cold=True) if again else choice
+        for given in choices:
             answer = _answer(controller, given, state)
             if answer.step is not None and _inside(controller.manifest.mv, answer.step.mv):
                 break
         answers.append(answer)
         if answer.step is not None:
             state, last = answer.step.state, answer.step.mv
-            since = 1 if answer.given.cold else since + 1
         try:
             choices = drawn.send((answer.given, last))
         except StopIteration:
             return answers
 
 
+def beginnings(
+    controller: Controller, answers: list[StepResult], scale: Mapping[str, Array], most: float
+) -> list[bool]:
+    """Whether a chained run takes the given state at each step: at the cold ones, and where last digits grew too far.
+
+    A second run goes beside the answers and nudges each state that it carries on. Where it would part by more than
+    ``most`` nudges of the entries' ``scale``, the chain begins again from the given state. So a host that is right in
+    each step parts by about ``most`` times its difference at the most, whatever the law.
+    """
+    rng, state, begins = np.random.default_rng(2), controller.cold_state(), []
+    divisors = np.concatenate([scale[name] for name in OUTPUTS])
+
+    def beside(answer: StepResult, begin: Array) -> tuple[float, Array]:
+        """How many nudges the step from about this state parts from the answer, and the state that follows."""
+        step = _answer(controller, answer.given, _nudged(rng, begin)).step
+        if answer.step is None or step is None:
+            return (0.0 if step is answer.step else inf), begin
+        shares = np.abs(np.concatenate(step) - np.concatenate(answer.step)) / divisors
+        return float(shares.max()) / NUDGE, step.state
+
+    for answer in answers:
+        parted, after = beside(answer, state)
+        begins.append(answer.given.cold or parted > most)
+        state = beside(answer, answer.state)[1] if begins[-1] else after
+    return begins
+
+
+def _nudged(rng: np.random.Generator, state: Array) -> Array:
+    """The state (n_state,) with other last digits; whole numbers stay, since flags and counters have none."""
+    signs = rng.choice([-1.0, 1.0], state.shape)
+    return np.where(state == np.rint(state), state, state * (1 + NUDGE * signs))
+
+
 def _answer(controller: Controller, given: StepInputs, state: Array) -> StepResult:
+    begin = controller.cold_state() if given.cold else state
     try:
-        step = controller.step(**given.inputs, state=controller.cold_state() if given.cold else state)
+        step = controller.step(**given.inputs, state=begin)
     except SampleError:
-        return StepResult(given, None, "input")
+        return StepResult(given, begin, None, "input")
     except OutputError:
-        return StepResult(given, None, "output")
-    return StepResult(given, step)
+        return StepResult(given, begin, None, "output")
+    return StepResult(given, begin, step)
 
 
 def _inside(signals: tuple[Signal, ...], mv: Array) -> bool:
@@ -124,6 +153,7 @@ def _drawn(m: Manifest) -> Generator[list[StepInputs], tuple[StepInputs, Array],
                 spoilt = course[name].copy()
                 spoilt[i] = bad
                 yield [StepInputs("not finite", course | {name: spoilt})]
+                course = moved(course)  # at a rest, a state that was lost would look like the one that was kept
                 _, last = yield [StepInputs("after a refusal", course | {"mv_applied": last})]
 
 

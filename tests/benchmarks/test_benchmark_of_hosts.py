@@ -42,7 +42,7 @@ def test_python_passes_and_a_missing_host_is_named(
     said = capsys.readouterr()
     assert "other is left out: its parts" in said.err
     rows = [line.split(" | ") for line in said.out.splitlines() if line.startswith("| Python")]
-    assert rows[0][2:6] == ["1 of 1", "1", "1", "0"]
+    assert rows[0][2:7] == ["1 of 1", "1", "1", "0", "0"]
     megabytes = float(rows[0][-1].strip(" |"))
     assert 50 < megabytes < 500
     assert "`reversible_cstr/pid`" in said.out
@@ -57,8 +57,8 @@ def test_a_host_that_differs_or_does_not_load_fails(
     def differs(folder: Path) -> Iterator[object]:
         def run(kit: Path, out: Path) -> None:
             steps = [row.get("gives", {"refused": row.get("refused")}) for row in wrong["steps"]]
-            answers = {"sha256": wrong["sha256"], "p50_us": 1.0, "steps": steps, "scans": wrong["scans"]}
-            out.write_text(json.dumps(answers))
+            answers = {"sha256": wrong["sha256"], "p50_us": 1.0, "scans": wrong["scans"]}
+            out.write_text(json.dumps(answers | {"steps": steps, "chained": steps}))
 
         yield run, 0
 
@@ -71,7 +71,7 @@ def test_a_host_that_differs_or_does_not_load_fails(
 
     monkeypatch.setattr(hosts, "HOSTS", {"differs": differs})
     assert hosts.main() == 1
-    assert "1, 1e-03 FAILED" in capsys.readouterr().out
+    assert "1, 1e-03, 1e-03 FAILED" in capsys.readouterr().out
     monkeypatch.setattr(hosts, "HOSTS", {"broken": broken})
     assert hosts.main() == 1
     said = capsys.readouterr()

@@ -77,8 +77,9 @@ def test_the_manual_describes_the_kit() -> None:
     described = set(re.findall(r"`(\w+)`", DOCS))
     named = {*vectors, *vectors["steps"][0], *vectors["scans"][0], *vectors["steps"][0]["gives"]}
     assert named - {"kit", "what", "pv_margin"} <= described
-    assert float.fromhex(vectors["tolerance"]) == 1e-6
-    assert "the largest difference allowed (1e-6)" in DOCS
+    assert float.fromhex(vectors["tolerance"]) == 1e-9
+    assert float.fromhex(vectors["chained_tolerance"]) == 1e-6
+    assert "the largest difference allowed in one step (1e-9) and chained (1e-6)" in DOCS.replace("\n", " ")
     parts = Counter(step["part"] for step in vectors["steps"])
     for part, words in (
         ("anywhere", "60 with inputs anywhere"),

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from chromium import CHROMIUM, launched
-from kits import DAMAGES, EMBED, SHIPPED, SOME, kit_of, name, spoilt, verdict_on
+from kits import DAMAGES, EMBED, SHIPPED, SOME, an_old_version, kit_of, name, spoilt, verdict_on
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
@@ -67,16 +67,27 @@ def test_the_browser_passes_the_kit(page: Page, file: Path, tmp_path: Path) -> N
     (tmp_path / "answers.json").write_text(json.dumps(page.evaluate("window.answers")))
     verdict = verdict_on(file, tmp_path / "answers.json")
     assert verdict.passed, verdict.text()
-    assert verdict.steps > 300
-    assert verdict.largest < 1e-8  # measured: 4e-10
+    assert verdict.one_step.rows > 300
+    assert verdict.chained.largest < 1e-8  # measured: 4e-10
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_the_browser_does_not_pass_a_damaged_kit(page: Page, damage: str, tmp_path: Path) -> None:
     said = conform(page, spoilt(PID, tmp_path, DAMAGES[damage]))
     assert "FAILED" in said
-    larger = {"mv": "0.00100, 0 wrong", "state": "0.00100, 0 wrong", "moved": "0.800, 0 wrong"}
-    assert larger.get(damage, "1 wrong") in said
+    larger = {
+        "mv": "difference 0.00100, chained 0.00100, 0 wrong",
+        "state": "difference 0.00100, chained 0.00100, 0 wrong",
+        "given": ", 0 wrong",
+        "refusal": ", 2 wrong",
+        "moved": "chained 0.800, 0 wrong",
+    }
+    assert larger.get(damage, ", 1 wrong") in said
+
+
+def test_the_browser_refuses_an_old_kit(page: Page, tmp_path: Path) -> None:
+    said = conform(page, spoilt(PID, tmp_path, an_old_version))
+    assert said == "error: the kit has the version 3, not 4: write it again with loopwright conformance FILE.onnx KIT\n"
 
 
 def test_the_browser_s_loop_scans_once_a_period(page: Page) -> None:

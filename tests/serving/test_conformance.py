@@ -5,22 +5,30 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from kits import OLD
+from kits import an_old_version
 
-from loopwright.serving import Controller, LoopwrightError
+from loopwright.pipeline.export.controller_file import file_bytes
+from loopwright.pipeline.export.gate import export
+from loopwright.serving import Controller, LoopwrightError, OutputError, SampleError
 from loopwright.serving.__main__ import main
 from loopwright.serving.conformance.kit import PASS, VECTORS, check, read, write_kit, written
+from loopwright.serving.controller_file import TRAILER_BYTES
 
 pytest_plugins = ["small_laws"]
 Capture = pytest.CaptureFixture[str]
 Json = dict[str, Any]
+Array = np.ndarray[Any, np.dtype[np.float64]]
 
 
 @pytest.fixture(scope="module")
@@ -39,14 +47,80 @@ def vectors(kit: Path) -> Json:
 @pytest.fixture
 def answers(vectors: Json) -> Json:
     """The answers of a host that does all as it must."""
+    return perfect(vectors)
+
+
+def perfect(vectors: Json) -> Json:
     steps = [{"refused": row["refused"]} if "refused" in row else row["gives"] for row in vectors["steps"]]
     scans = [{name: row[name] for name in ("mode", "fault", "mv")} for row in vectors["scans"]]
-    return {"host": "Perfect", "onnxruntime": "0", "sha256": vectors["sha256"], "steps": steps, "scans": scans}
+    whole = {"host": "Perfect", "onnxruntime": "0", "sha256": vectors["sha256"]}
+    copy: Json = json.loads(json.dumps(whole | {"steps": steps, "chained": steps, "scans": scans}))
+    return copy
+
+
+def same(state: Array) -> Array:
+    return state
+
+
+def played(
+    controller: Controller,
+    vectors: Json,
+    *,
+    takes: Callable[[Array], Array] = same,
+    keeps: Callable[[Array], Array] = same,
+    rounds: Callable[[Array], Array] = same,
+    refused: Callable[[Array], Array] = same,
+) -> Json:
+    """The answers of a host that does these things to the state: as given, from step to step, and where it refuses.
+
+    ``rounds`` is what its arithmetic does to every number that it computes.
+    """
+    answers = perfect(vectors)
+    for run in ("steps", "chained"):
+        rows: list[Json] = []
+        state = controller.cold_state()
+        for row in vectors["steps"]:
+            inputs: Json = dict.fromkeys(("sp", "pv", "mv_applied"))
+            inputs |= {name: read(texts, name) for name, texts in row["given"].items()}
+            given_state = inputs.pop("state")
+            if run == "steps":
+                state = takes(given_state)
+            elif row["begins"]:
+                state = given_state
+            try:
+                step = controller.step(**inputs, state=state)
+            except (SampleError, OutputError) as error:
+                rows.append({"refused": "input" if isinstance(error, SampleError) else "output"})
+                state = refused(state)
+                continue
+            mv, after, info = map(rounds, step)
+            rows.append({"mv": written(mv), "state_next": written(after), "info": written(info)})
+            state = keeps(after)
+        answers[run] = rows
+    return answers
 
 
 def chain(vectors: Json) -> list[Json]:
     parts = {"anywhere", "inside", "course", "saturation", "stuck actuator"}
     return [row for row in vectors["steps"] if row["part"] in parts]
+
+
+def test_each_step_starts_from_its_stated_state(pi_file: Path, vectors: Json) -> None:
+    controller, before = Controller(pi_file), None
+    cold = written(controller.cold_state())
+    for row in vectors["steps"]:
+        inputs = {name: read(texts, name) for name, texts in row["given"].items()}
+        state = row["given"]["state"]
+        assert state == (cold if row["cold"] else before)  # a state that the chain visits
+        if "refused" in row:
+            with pytest.raises(SampleError):
+                controller.step(**inputs)
+            continue
+        step = controller.step(**inputs)
+        found = {"mv": written(step.mv), "state_next": written(step.state), "info": written(step.info)}
+        assert found == row["gives"]
+        before = row["gives"]["state_next"]
+    assert len({tuple(row["given"]["state"]) for row in vectors["steps"]}) > 200
 
 
 def test_300_steps_are_chained_over_the_whole_ranges(pi_file: Path, vectors: Json) -> None:
@@ -64,20 +138,15 @@ def test_300_steps_are_chained_over_the_whole_ranges(pi_file: Path, vectors: Jso
     assert ((mv > 0) & (mv < 100)).sum() > 100  # and elsewhere a wrong digit shows
 
 
-def test_each_value_that_is_not_finite_is_refused_and_the_next_step_follows_the_last_good_one(
-    pi_file: Path, vectors: Json
-) -> None:
-    controller, spoilt = Controller(pi_file), []
-    state = controller.cold_state()
-    for row in vectors["steps"]:
-        inputs = {name: read(texts, name) for name, texts in row["given"].items()}
-        if "refused" in row:
-            spoilt += [(n, i, str(v)) for n, vs in inputs.items() for i, v in enumerate(vs) if not math.isfinite(v)]
-            continue
-        step = controller.step(**inputs, state=controller.cold_state() if row["cold"] else state)
-        assert written(step.mv) == row["gives"]["mv"]
-        assert written(step.state) == row["gives"]["state_next"]
-        state = step.state
+def test_each_value_that_is_not_finite_is_refused(vectors: Json) -> None:
+    spoilt = [
+        (name, i, str(value))
+        for row in vectors["steps"]
+        if "refused" in row
+        for name, texts in row["given"].items()
+        for i, value in enumerate(read(texts, name))
+        if not math.isfinite(value)
+    ]
     places = [("sp", 0), ("pv", 0), ("pv", 1), ("mv_applied", 0)]
     assert Counter(spoilt) == Counter((n, i, bad) for n, i in places for bad in ("nan", "inf", "-inf"))
 
@@ -142,34 +211,127 @@ def test_the_scans_hold_commands_that_did_not_arrive(vectors: Json) -> None:
     assert rows[unread]["mv"] == rows[unread - 2]["mv"]  # what the plant had before the command that was lost
 
 
-@pytest.mark.parametrize("version", OLD)
-def test_an_old_kit_is_read_and_its_verdict_says_what_it_does_not_show(
-    pi_file: Path, kit: Path, answers: Json, tmp_path: Path, version: int
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_an_old_kit_is_one_line_that_says_what_to_do(
+    pi_file: Path, vectors: Json, answers: Json, tmp_path: Path, capsys: Capture, version: int
 ) -> None:
-    old = tmp_path / "old"
-    old.mkdir()
-    vectors = json.loads((kit / VECTORS).read_text())
-    OLD[version](vectors)
-    (old / VECTORS).write_text(json.dumps(vectors))
-    answers["scans"] = [{name: row[name] for name in ("mode", "fault", "mv")} for row in vectors["scans"]]
-    verdict = judged(pi_file, old, answers, tmp_path)
+    an_old_version(vectors)
+    (tmp_path / VECTORS).write_text(json.dumps(vectors | {"kit": version}))
+    path = tmp_path / "answers.json"
+    del answers["chained"]
+    path.write_text(json.dumps(answers))
+    assert main(["conformance", str(pi_file), str(tmp_path), "--check", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert f"{VECTORS} has the version {version}; this release reads 4: write it again with" in said
+    assert said.count("\n") == 1
+
+
+def test_a_host_that_does_all_as_it_must_passes(pi_file: Path, kit: Path, vectors: Json, tmp_path: Path) -> None:
+    verdict = judged(pi_file, kit, played(Controller(pi_file), vectors), tmp_path)
     assert verdict.passed
-    words = "it does not show that the host writes nothing before it knows the plant"
-    assert (words in verdict.text()) is (version == 1)
-    assert "writes nothing over an MV that was moved after a command that did not arrive" in verdict.text()
-    assert not judged(pi_file, kit, answers, tmp_path).passed  # and such a host fails the present kit
+    assert verdict.identical
+    assert verdict.one_step.largest == verdict.chained.largest == 0
+    assert verdict.one_step.rows > 300
+    assert verdict.chained.rows > verdict.one_step.rows  # the scans, too
+    first, one_step, chained = verdict.text().split("\n")
+    assert first == "Perfect, onnxruntime 0: passed"
+    assert one_step.startswith("  one step: largest difference 0 of an entry's scale, allowed 1e-09, the same bits in")
+    assert chained.startswith("  chained: sensitivity 0 of an entry's scale, allowed 1e-06, the same bits in")
 
 
-def test_the_present_kit_leaves_nothing_unsaid(pi_file: Path, kit: Path, answers: Json, tmp_path: Path) -> None:
-    assert judged(pi_file, kit, answers, tmp_path).note == ""
+def without_the_last(state: Array) -> Array:
+    return np.concatenate([state[:-1], [0.0]])
 
 
-def test_a_host_that_does_all_as_it_must_passes(pi_file: Path, kit: Path, answers: Json, tmp_path: Path) -> None:
-    verdict = judged(pi_file, kit, answers, tmp_path)
-    assert verdict.passed
-    assert verdict.largest == 0
-    assert verdict.same_bits == verdict.steps > 300
-    assert verdict.text().startswith("Perfect, onnxruntime 0: passed\n  same bits in")
+CARRIED = "each step is right by itself: look at how the host keeps its state from one to the next"
+
+
+def test_a_host_that_takes_a_part_of_the_given_state_fails_in_one_step(
+    pi_file: Path, kit: Path, vectors: Json, tmp_path: Path
+) -> None:
+    verdict = judged(pi_file, kit, played(Controller(pi_file), vectors, takes=without_the_last), tmp_path)
+    assert not verdict.passed
+    assert verdict.one_step.largest > 1e-3
+    assert verdict.chained.identical
+    assert CARRIED not in verdict.text()
+
+
+def test_a_host_that_carries_a_part_of_its_state_on_fails_chained(
+    pi_file: Path, kit: Path, vectors: Json, tmp_path: Path
+) -> None:
+    verdict = judged(pi_file, kit, played(Controller(pi_file), vectors, keeps=without_the_last), tmp_path)
+    assert not verdict.passed
+    assert verdict.one_step.identical
+    assert verdict.chained.largest > 1e-3
+    assert CARRIED in verdict.text()
+
+
+def test_a_host_that_loses_its_state_at_a_refused_step_fails_chained(
+    pi_file: Path, kit: Path, vectors: Json, tmp_path: Path
+) -> None:
+    verdict = judged(pi_file, kit, played(Controller(pi_file), vectors, refused=np.zeros_like), tmp_path)
+    assert not verdict.passed
+    assert verdict.one_step.identical
+    assert verdict.chained.rows - verdict.chained.same_bits == 12  # the steps after a refusal, and no other
+    assert "(after a refusal)" in verdict.chained.where
+
+
+@pytest.fixture(scope="module")
+def chaotic_file(make_formula: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ricker's map, whose last digits grow until nothing is left of the others."""
+
+    def formula(law: Any, sp: Any, pv: Any, dv: Any, mv_applied: Any, state: Any) -> Any:
+        grown = 20.0 * (state + 0.5) * torch.exp(-(state + 0.5))
+        return law.limited(40.0 + state[..., :1], mv_applied), grown - 0.5, state[..., :1]
+
+    path = tmp_path_factory.mktemp("chaotic") / "law.onnx"
+    export(make_formula(formula, 1, ("it",)), path, case="none", provenance={"from": "a test"})
+    return path
+
+
+def another_processor(values: Array) -> Array:
+    """Some units in the last place."""
+    return values * (1 + 4e-16)
+
+
+def silent_copy(file: Path, to: Path) -> Path:
+    """The same law in a file whose manifest does not say that it amplifies last digits."""
+    model = onnx.ModelProto.FromString(file.read_bytes()[:-TRAILER_BYTES])
+    del model.metadata_props[:]
+    to.write_bytes(file_bytes(model.SerializeToString(), replace(Controller(file).manifest, provenance={})))
+    return to
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_law_that_amplifies_last_digits_passes(chaotic_file: Path, tmp_path: Path, told: bool) -> None:
+    """Equal in each step; its chain begins again before two right hosts part, as an unbroken one shows that they do."""
+    file = chaotic_file if told else silent_copy(chaotic_file, tmp_path / "law.onnx")
+    controller, kit = Controller(file), tmp_path / "kit"
+    vectors = write_kit(controller, kit)
+    verdict = judged(file, kit, played(controller, vectors, rounds=another_processor), tmp_path)
+    assert verdict.passed, verdict.text()
+    assert 0 < verdict.one_step.largest < 1e-15
+    assert 10 * verdict.one_step.largest < verdict.chained.largest < 1e-10
+    for row in vectors["steps"]:
+        row["begins"] = row["cold"]
+    verdict = judged(file, kit, played(controller, vectors, rounds=another_processor), tmp_path)
+    assert verdict.one_step.largest < 1e-15  # it does not depend on how far a chained run parts
+    assert verdict.chained.largest > 0.1
+    assert CARRIED in verdict.text()
+
+
+def test_the_chain_of_a_law_that_amplifies_nothing_begins_again_when_cold_alone(vectors: Json) -> None:
+    assert all(row["begins"] is row["cold"] for row in vectors["steps"])
+
+
+@pytest.mark.parametrize("share", [1e-10, 1e-12])
+def test_a_host_that_is_right_in_each_step_is_right_chained(chaotic_file: Path, tmp_path: Path, share: float) -> None:
+    """However far the digits go in which it differs, below what one step allows."""
+    controller, kit = Controller(chaotic_file), tmp_path / "kit"
+    vectors = write_kit(controller, kit)
+    verdict = judged(chaotic_file, kit, played(controller, vectors, rounds=lambda v: v * (1 + share)), tmp_path)
+    assert verdict.passed, verdict.text()
+    assert verdict.one_step.largest == pytest.approx(share, rel=0.2)
 
 
 def test_what_a_host_says_of_itself_acts_on_nobody(pi_file: Path, kit: Path, answers: Json, tmp_path: Path) -> None:
@@ -186,33 +348,44 @@ def judged(file: Path, kit: Path, answers: Json, tmp_path: Path) -> Any:
     return check(kit, path, Controller(file).sha256)
 
 
-@pytest.mark.parametrize(
-    ("share", "passes"), [(1e-9, True), (0.9e-6, True), (1.1e-6, False), (1e-3, False), (math.nan, False)]
-)
+@pytest.mark.parametrize("share", [1e-12, 0.9e-9, 1.1e-9, 0.9e-6, 1.1e-6, 1e-3, math.nan])
 @pytest.mark.parametrize("name", ["mv", "state_next", "info"])
+@pytest.mark.parametrize(("run", "word", "allowed"), [("steps", "step", 1e-9), ("chained", "chained step", 1e-6)])
 def test_a_difference_counts_as_a_share_of_the_scale(
-    pi_file: Path, kit: Path, vectors: Json, answers: Json, tmp_path: Path, name: str, share: float, passes: bool
+    pi_file: Path,
+    kit: Path,
+    vectors: Json,
+    answers: Json,
+    tmp_path: Path,
+    name: str,
+    share: float,
+    run: str,
+    word: str,
+    allowed: float,
 ) -> None:
-    scale, old = float.fromhex(vectors["scale"][name][-1]), float.fromhex(answers["steps"][200][name][-1])
-    answers["steps"][200][name][-1] = (old + share * scale).hex()
+    scale, old = float.fromhex(vectors["scale"][name][-1]), float.fromhex(answers[run][200][name][-1])
+    answers[run][200][name][-1] = (old + share * scale).hex()
     verdict = judged(pi_file, kit, answers, tmp_path)
-    assert verdict.passed is passes
-    assert verdict.same_bits == verdict.steps - 1
-    assert verdict.largest == pytest.approx(share if math.isfinite(share) else math.inf, rel=1e-3)
-    assert verdict.where.startswith("step 200 (")
-    assert f": {name}[" in verdict.where
-
-
-def changed_last_bit(answers: Json) -> None:
-    text = answers["steps"][100]["mv"][0]
-    answers["steps"][100]["mv"][0] = math.nextafter(float.fromhex(text), math.inf).hex()
+    assert verdict.passed is (share < allowed)
+    assert not verdict.identical
+    found, other = verdict.one_step, verdict.chained
+    if run == "chained":
+        found, other = other, found
+    assert other.identical
+    assert other.largest == 0
+    assert found.same_bits == found.rows - 1
+    assert found.largest == pytest.approx(share if math.isfinite(share) else math.inf, rel=1e-3)
+    assert found.where.startswith(f"{word} 200 (")
+    assert f": {name}[" in found.where
 
 
 def test_one_bit_is_seen(pi_file: Path, kit: Path, answers: Json, tmp_path: Path) -> None:
-    changed_last_bit(answers)
+    text = answers["steps"][100]["mv"][0]
+    answers["steps"][100]["mv"][0] = math.nextafter(float.fromhex(text), math.inf).hex()
     verdict = judged(pi_file, kit, answers, tmp_path)
     assert verdict.passed
-    assert verdict.same_bits == verdict.steps - 1
+    assert verdict.one_step.same_bits == verdict.one_step.rows - 1
+    assert not verdict.identical
 
 
 @pytest.mark.parametrize(
@@ -221,9 +394,12 @@ def test_one_bit_is_seen(pi_file: Path, kit: Path, answers: Json, tmp_path: Path
         (lambda a: a["steps"][-2].pop("refused"), "computed, but must be refused because of the input"),
         (lambda a: a["steps"].__setitem__(5, {"refused": "output"}), "refused because of the output, but must be"),
         (lambda a: a["steps"][-2].update(refused="output"), "of the output, but must be refused because of the input"),
-        (lambda a: a["steps"].pop(), "steps are answered instead of"),
-        (lambda a: a["scans"].pop(), "scans are answered instead of"),
-        (lambda a: a["steps"][7]["mv"].append("0x0p+0"), "2 numbers instead of 1"),
+        (lambda a: a["chained"][-2].pop("refused"), "chained step 352 (not finite): computed, but must be"),
+        (lambda a: a["steps"].pop(), "steps: 353 are answered instead of 354"),
+        (lambda a: a["chained"].pop(), "chained: 353 are answered instead of 354"),
+        (lambda a: a["scans"].pop(), "are answered instead of"),
+        (lambda a: a["steps"][7]["mv"].append("0x0p+0"), "step 7 (anywhere): mv: 2 numbers instead of 1"),
+        (lambda a: a["scans"][5]["mv"].append("0x0p+0"), "mv: 2 numbers instead of 1"),
         (lambda a: a["scans"][5].update(mode="AUTO"), "mode is 'AUTO', but must be 'HOLD'"),
         (lambda a: a["scans"][5].update(fault=False), "fault is False, but must be True"),
         (lambda a: a["scans"][0].update(mv=a["scans"][4]["mv"]), "an MV is written, but where it stands is not known"),
@@ -244,6 +420,7 @@ def test_what_no_tolerance_excuses(
     [
         (lambda a: a.update(sha256="0" * 64), "is for the controller with the SHA-256 000"),
         (lambda a: a.update(steps="all"), "the answers have no list of objects 'steps'"),
+        (lambda a: a.pop("chained"), "the answers have no list of objects 'chained'"),
         (lambda a: a["steps"][3].update(mv=["1.5 K"]), "step 3 (anywhere): mv holds no hexadecimal float"),
         (lambda a: a["steps"][3].pop("info"), "step 3 (anywhere): info is 'None'; it must be a list"),
     ],
