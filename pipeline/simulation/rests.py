@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.step_response import NEVER_SETTLES, late_slope
 from loopwright.pipeline.plants.simulator import Array, Simulator
 
 RESTING = 2_000  # periods that a plant is given to come to rest
@@ -17,8 +18,6 @@ CHANGE = 1e-6  # of a state or of an MV's range: for slopes
 REST_ITERATIONS = 12  # iterations
 BALANCED = 1e-6  # largest residual of a balance that was found
 LOCAL_GAIN_STEP = 0.02  # of an MV's range: for local gains
-# of a difference, over RESTING periods at its late rate: a CV that moves more does not settle
-NEVER_SETTLES = 0.2
 WEAK_SLOPE = 1e-7  # of the largest slope: a direction in which nothing is decided
 
 
@@ -73,7 +72,7 @@ def local_gains(plant: Simulator, mv: int, places: Array, middle: Array, n_cv: i
     pairs[0, :, mv], pairs[1, :, mv] = places + size, places - size
     y = courses(plant, plant.start[0], pairs.reshape(-1, len(middle)), RESTING)[..., :n_cv]
     apart = (y[: len(places)] - y[len(places) :]) / (2 * size)  # (places, samples, n_cv)
-    late = (apart[:, -1] - apart[:, -RESTING // 4]) / (RESTING // 4 - 1)
+    late = late_slope(np.moveaxis(apart, 1, -1), RESTING // 4 - 1)
     moving = np.abs(late) * RESTING > NEVER_SETTLES * np.abs(apart[:, -1])
     return np.where(moving, late, apart[:, -1]), moving
 
