@@ -9,13 +9,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.steady_state import RESTING
 from loopwright.pipeline.dynamics.step_response import SETTLED_BAND, UNSETTLED_CV, late_change, settling_index
 from loopwright.pipeline.evaluation.case import Array
 from loopwright.pipeline.evaluation.one_side import LATER_WAY, LATER_WAY_VISITED
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
-from loopwright.pipeline.simulation.rests import BALANCED, RESTING, answered, balanced, courses, inside, settled
+from loopwright.pipeline.simulation.rests import BALANCED, answered, balanced, courses, inside, settled
 from loopwright.serving.manifest import Signal
 
 VISITED_MV, VISITED_CV = (0.1, 0.9), (0.01, 0.99)  # quantiles of the record between which tests move
