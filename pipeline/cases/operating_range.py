@@ -9,20 +9,20 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.steady_state import RESTING
+from loopwright.pipeline.dynamics.step_response import SETTLED_BAND, UNSETTLED_CV, late_change, settling_index
 from loopwright.pipeline.evaluation.case import Array
 from loopwright.pipeline.evaluation.one_side import LATER_WAY, LATER_WAY_VISITED
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.records.record import Record
-from loopwright.pipeline.simulation.rests import BALANCED, RESTING, answered, balanced, courses, inside, settled
+from loopwright.pipeline.simulation.rests import BALANCED, answered, balanced, courses, inside, settled
 from loopwright.serving.manifest import Signal
 
 VISITED_MV, VISITED_CV = (0.1, 0.9), (0.01, 0.99)  # quantiles of the record between which tests move
 LEAST_VISITED = 0.05  # of an MV's commanded range, where that cuts the visited one
 TEST_LEVELS = 6  # set points of a sequence
-ANSWER_SETTLED = 0.05  # of the largest answer
 LEAST_TIMED_ANSWER = 0.2  # of a CV's largest answer to an MV: a smaller one says nothing about how long it takes
-UNSETTLED_CV = 0.05  # of the CV's visited range in the last quarter of RESTING: a CV that moves more does not settle
 # a set point lasts so many times as long as an answer; the fewest and most samples
 ANSWERS_A_SET_POINT, HOLD_SAMPLES = 3, (30, 400)
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3, 0.2, 0.1)  # of the distance of drawn MVs from their medians
@@ -69,14 +69,14 @@ class Reach:
     @cached_property
     def integrates(self) -> tuple[int, ...]:
         """Places of the CVs that do not settle under constant MVs."""
-        late = np.abs(self._courses[:, :, -1] - self._courses[:, :, -RESTING // 4]).max(axis=(0, 1))
+        late = np.abs(late_change(np.moveaxis(self._courses, 2, -1), RESTING // 4 - 1)).max(axis=(0, 1))
         return tuple(int(i) for i in np.flatnonzero(late > UNSETTLED_CV * (self.cv[2] - self.cv[0])))
 
     @cached_property
     def hold(self) -> int:
         """Samples of a set point: three times what the slowest CV needs, and within ``HOLD_SAMPLES``.
 
-        A CV that settles needs the time to ``ANSWER_SETTLED`` of its largest answers. One that does not settle needs
+        A CV that settles needs the time to ``SETTLED_BAND`` of its largest answers. One that does not settle needs
         the time in which the strongest MV, over all of its range, carries it across its visited range: no loop could be
         faster.
         """
@@ -88,10 +88,9 @@ class Reach:
                 crossed = of * whole[:, None] >= self.cv[2, i] - self.cv[0, i]
                 needed.append(int(np.where(crossed.any(axis=1), crossed.argmax(axis=1), RESTING).min()))
                 continue
-            strong = np.flatnonzero(of.max(axis=1) >= LEAST_TIMED_ANSWER * of.max())
-            for j in strong:
-                away = np.abs(self.answers[j, :, i] - self.answers[j, -1, i]) > ANSWER_SETTLED * of[j].max()
-                needed.append(int(np.flatnonzero(away)[-1]) + 1 if away.any() else 1)
+            most = of.max(axis=1)
+            settled_after = settling_index(self.answers[:, :, i], SETTLED_BAND * most)
+            needed += settled_after[most >= LEAST_TIMED_ANSWER * of.max()].tolist()
         return int(np.clip(ANSWERS_A_SET_POINT * max(needed), *HOLD_SAMPLES))
 
     @cached_property

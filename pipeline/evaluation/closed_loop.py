@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loopwright.pipeline.dynamics.step_response import settled_index
 from loopwright.pipeline.evaluation.metric import METRICS
 from loopwright.pipeline.metrics import errors, ise, mv_travel
 
@@ -103,8 +104,7 @@ def settling_samples(sp: ArrayLike, pv: ArrayLike, hold: int, span: float = 1.0)
     settled = []
     for part in holds(error.size, hold):
         e = np.abs(error[part])
-        outside = np.nonzero(e > max(STEP_BAND * e[0], RANGE_BAND * span))[0]
-        settled.append(float(outside[-1] + 1) if outside.size else 0.0)
+        settled.append(float(settled_index(e, max(STEP_BAND * e[0], RANGE_BAND * span))))
     return np.array(settled)
 
 

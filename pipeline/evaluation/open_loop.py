@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from loopwright.pipeline.dynamics.step_response import SEEN_CV_MOVE
 from loopwright.pipeline.errors import PlantError, RecordError
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.metric import together
@@ -142,7 +143,6 @@ def replay(law: Steps, record: Record, signals: Signals, ahead: int, *, same_row
 
 
 DEAD_TIME_MOVE = 0.1  # of an MV's range
-SEEN_CV_MOVE = 1e-6  # of a controlled variable's range: less is rounding
 LONGEST_DEAD_TIME = 200  # samples
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from loopwright.pipeline.dynamics.step_response import SETTLED_BAND, STILL_MOVES, settling_index
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.records.record import Record
@@ -14,9 +15,7 @@ from loopwright.pipeline.simulation.simulate import noise_draws
 
 FIRST_STEP = 0.05  # of an MV's range
 SHORT_RUN, LONGEST_RUN = 200, 6_400  # periods of a run: doubled until it settles
-CHANGE_SETTLED = 0.05  # of the change
 EXPLODES = 1e5  # ranges of a PV within LONGEST_RUN periods: no integrator that can be controlled gets there
-STILL_MOVES = 0.1  # of the change, in the last fifth of a run: it does not settle
 START_RESTS = 0.02  # of a PV's range, in LONGEST_RUN periods without a step: the start is a rest
 TRIED_WAYS = (1.0, 0.8, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # shares of the way from the start to an end of the MV's range
 CROSSED = 0.1  # of the PV's range: a plant that does not settle is measured by the time it takes to cross that
@@ -118,19 +117,16 @@ def _settled(plant: Simulator, base: Array, mv: Array) -> tuple[Array, bool]:
         late = np.ptp(change[4 * n // 5 :], axis=0) if n > 5 else np.full(base.shape[1], np.inf)
         most = np.max(np.abs(change), axis=0, initial=0.0)
         room = np.array([s.high - s.low for s in plant.pv_signals])
-        if n == length and np.all((late <= STILL_MOVES * CHANGE_SETTLED * most) | (most <= 1e-9 * room)):
+        if n == length and np.all((late <= STILL_MOVES * SETTLED_BAND * most) | (most <= 1e-9 * room)):
             return change, bool(np.any(most > 1e-9 * room)) or length == LONGEST_RUN
         length *= 2
     return change, bool(np.all(late <= STILL_MOVES * most))
 
 
 def _settling(change: Array, room: Array) -> int:
-    """Periods after which every PV that moves stays within CHANGE_SETTLED of its end."""
-    longest = 1
-    for y in change[:, np.max(np.abs(change), axis=0) > 1e-6 * room].T:
-        outside = np.flatnonzero(np.abs(y - y[-1]) > CHANGE_SETTLED * np.max(np.abs(y)))
-        longest = max(longest, int(outside[-1]) + 1 if outside.size else 1)
-    return longest
+    """Periods after which every PV that moves stays within SETTLED_BAND of its end."""
+    y = change[:, np.max(np.abs(change), axis=0) > 1e-6 * room].T
+    return int(settling_index(y, SETTLED_BAND * np.max(np.abs(y), axis=1)).max(initial=1))
 
 
 def _reach(plant: Simulator, mv0: Array, j: int, end: float, periods: int) -> float:

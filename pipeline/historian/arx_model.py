@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.step_response import SETTLED_IN_RECORD, settling_index
 from loopwright.pipeline.metrics import Array
 
 Blocks = tuple[tuple[int, int], ...]
@@ -87,8 +88,7 @@ class Linear:
         answer = self.step_response(i, length)
         if not np.isfinite(answer).all() or abs(answer[-1]) <= 1e-12:
             return 0
-        outside = np.flatnonzero(np.abs(answer - answer[-1]) > 0.1 * abs(answer[-1]))
-        rows = int(outside[-1]) + 1 if outside.size else 1
+        rows = max(int(settling_index(answer, SETTLED_IN_RECORD * abs(answer[-1]))), 1)
         return rows if rows < LATEST_SETTLED * length else 0
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.step_response import SETTLED_BESIDE_DRIFT, settling_index
 from loopwright.pipeline.historian.arx_model import (
     BLOCKS,
     LEAST_ARX_ROWS,
@@ -31,7 +32,6 @@ from loopwright.pipeline.records.record import Record
 
 # lags beyond BLOCKS that share a coefficient; the last are left out first
 SLOW_LAGS = ((41, 81), (81, 161), (161, 321))
-DRIFT_SETTLED = 0.15  # of an answer's largest value: within it an answer has settled
 WEAK_INPUT = 0.01  # part in the answer, over the strongest input's
 MOST_LAG_SHARE = 0.05  # of the rows: longer lags explain by chance what the inputs did not cause
 DRIFT_CHUNK = 200_000  # rows
@@ -84,11 +84,11 @@ def _inputs(u: Sequence[Array], centre: Array, rows: NDArray[np.int64], blocks: 
 
 
 def _settling(theta: Array, motion: Array, blocks: Blocks) -> int:
-    """Rows after which the answer to a step of the strongest input stays within DRIFT_SETTLED of its largest value."""
+    """Rows after which the answer to a step of the strongest input stays within 15 % of its largest value."""
     answers = np.cumsum(theta[:-1].reshape(len(motion), len(blocks)), axis=1)
     strongest = answers[int(np.argmax(np.abs(answers).max(axis=1) * motion))]
-    outside = np.flatnonzero(np.abs(strongest - strongest[-1]) > DRIFT_SETTLED * np.abs(strongest).max())
-    return blocks[min(int(outside[-1]) + 1, len(blocks) - 1)][1] - 1 if outside.size else 1
+    settled = int(settling_index(strongest, SETTLED_BESIDE_DRIFT * np.abs(strongest).max()))
+    return blocks[settled][1] - 1 if settled else 1
 
 
 # -------------------------------------------------------------------------------------------------- what is left of it

@@ -9,6 +9,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.step_response import (
+    SETTLED_IN_RECORD,
+    SLOPE_KEPT,
+    ramp_delay,
+    settling_index,
+    slope_thirds,
+)
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.answers import COLOUR, whitening
 from loopwright.pipeline.historian.arx_model import Linear, blocks_of, fit_arx, least_squares
@@ -26,7 +33,6 @@ FIR_BLOCK_GROWTH = 1.25  # by which a block of lags is longer than the one befor
 FOLLOWED_SETTLINGS = 2.0  # settling times, over which the answer is followed
 END_UNCERTAIN = 0.06  # of the answer's end: its standard deviation, from which on it is not known where it settles
 RESPONSES_AGREE = 1.6  # ratio of two settling times that are the same, blocks of lags being as wide as they are
-SETTLED_WITHIN = 0.1  # of the end, as `Linear.settling`
 ROWS_A_LAG = 4  # rows of the fit for each of its coefficients, at least
 RAMP_ROWS, RAMP_GROWTH = 60, 1.3  # rows over which a ramp is followed, and its end over the middle
 MOST_FIR_ROWS = 24_000  # rows of a fit, the first ones: more cost time and hardly change it
@@ -47,9 +53,8 @@ class StepAnswer:
 
     @property
     def settles(self) -> int:
-        """Rows after which the answer stays within SETTLED_WITHIN of its end, as far as the errors tell."""
-        outside = np.abs(self.value - self.value[-1]) > SETTLED_WITHIN * abs(self.value[-1]) + self.sd
-        return int(self.lag[np.flatnonzero(outside)[-1] + 1]) if outside.any() else int(self.lag[0])
+        """Rows after which the answer stays within SETTLED_IN_RECORD of its end, as far as the errors tell."""
+        return int(self.lag[settling_index(self.value, SETTLED_IN_RECORD * abs(self.value[-1]) + self.sd)])
 
 
 def step_answers(y: Array, u: Sequence[Array], run: NDArray[np.int64], length: int) -> list[StepAnswer] | None:
@@ -152,7 +157,6 @@ AGREES = 1.3  # ratio of two settling times that are the same
 CLEAR_ANSWER = 10.0  # strength of an answer
 A_PART = 0.1  # of what the largest answer of a PV is: smaller ones do not count
 MOST_SETTLING_SHARE = 0.2  # of the rows, up to which an answer's settling is believed
-RAMP_SLOPE_KEPT = 0.9  # share of its slope that an answer keeps which goes on and on
 RAMP_LINE, LATENESS = (41, 120), 3  # rows between which a ramp's line is laid, and how often its lateness is taken
 MV_MOVE = 0.02  # of an MV's span
 
@@ -340,15 +344,15 @@ def _answers(model: Linear, spans: Array, n_mv: int) -> dict[int, tuple[bool, fl
 
 def _goes_on(course: Array) -> bool:
     """Whether a step response (n,) ends with a steady slope."""
-    middle, end = (float(np.median(part)) for part in np.array_split(np.diff(course), 3)[1:])
-    return end != 0 and RAMP_SLOPE_KEPT < middle / end < 1 / RAMP_SLOPE_KEPT
+    _, middle, end = map(float, slope_thirds(np.diff(course)))
+    return end != 0 and SLOPE_KEPT < middle / end < 1 / SLOPE_KEPT
 
 
 def _late(course: Array) -> float:
     """LATENESS times the rows by which a ramp comes later than one that begins at once: dead time and lags together."""
     first, last = RAMP_LINE
     slope = (course[last] - course[first]) / (last - first)
-    late = last - course[last] / slope if slope else 0.0
+    late = ramp_delay(last, course[last], slope) if slope else 0.0
     return LATENESS * max(float(late), 0.5)
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from loopwright.pipeline.dynamics.step_response import answers_after
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.simulator import Simulator
-from loopwright.pipeline.tuning.responses import ANSWERED_CHANGE, RESPONSE_STEP, SHORTEST_STEP_RUN, StepResponses
+from loopwright.pipeline.tuning.responses import RESPONSE_STEP, SHORTEST_STEP_RUN, StepResponses
 
 INSTEAD = "choose law 'predictive' or 'pid', or remove the section"
 
@@ -57,9 +58,7 @@ def _require_an_observation(law: type[ControlLaw], within: int, plant: Simulator
         x = advance(x, moved)
         course.append(plant.measured(x))
     answer = np.abs(np.diff(np.array(course), axis=1)[:, 0])  # (n, n_pv)
-    change = np.abs(np.diff(answer, axis=0, prepend=0.0))
-    answered = change > ANSWERED_CHANGE * change.max(axis=0)
-    after = np.where(answered.any(axis=0), 1 + answered.argmax(axis=0), SHORTEST_STEP_RUN)
+    after = np.minimum(answers_after(answer.T), SHORTEST_STEP_RUN)
     if min(after) > within:
         found = ", ".join(f"{s.name} answers after {k}" for s, k in zip(plant.pv_signals, after, strict=True))
         raise LawError(

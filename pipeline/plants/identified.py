@@ -8,14 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.steady_state import START_REST_PERIODS, STATE_CHANGE, STILL_WITHIN, run_to_rest
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.plants.simulator import AdvanceMany, Array, Signals, Simulator
-
-START_REST_PERIODS = 2000
-"""Periods that the plant is given to come to rest at its start; a slower one is brought there by Newton's method."""
-
-STATE_CHANGE = 1e-10
-"""Change of the scaled state in a period that is none."""
 
 NEWTON_STEPS, NEWTON_SINGULAR, NEWTON_WITHIN = 12, 1e6, 10.0
 """Steps; condition of their equations beyond which a plant integrates; scaled outputs beyond which none is at rest."""
@@ -126,13 +121,15 @@ class IdentifiedPlant(Simulator):
 
     def _rest(self) -> Array:
         seen = np.zeros(len(self.arrays.y_scale))
-        start = x = self.arrays.rest @ np.concatenate([seen, self._v0, [1.0]])
-        for _ in range(START_REST_PERIODS):
-            before, x = x, self.arrays.advance(x, self._v0)
-            if not np.all(np.abs(x) < 1e3):
-                break
-            if np.max(np.abs(x - before)) < STATE_CHANGE:
-                return x
+        start = self.arrays.rest @ np.concatenate([seen, self._v0, [1.0]])
+
+        def hold(x: Array) -> tuple[Array, Array]:
+            ahead = self.arrays.advance(x, self._v0)
+            return ahead, np.abs(ahead - x)
+
+        x, moved = run_to_rest(hold, start, START_REST_PERIODS, STATE_CHANGE, within=STILL_WITHIN)
+        if np.all(np.abs(x) < STILL_WITHIN) and np.all(moved <= STATE_CHANGE):
+            return x
         found = self._rest_near(x)
         return np.concatenate([seen, start[len(seen) :]]) if found is None else found
 

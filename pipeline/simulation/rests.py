@@ -7,18 +7,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.steady_state import REST_LOOK, RESTING, STILL_STATE, run_to_rest
+from loopwright.pipeline.dynamics.step_response import NEVER_SETTLES, late_slope
 from loopwright.pipeline.plants.simulator import Array, Simulator
 
-RESTING = 2_000  # periods that a plant is given to come to rest
-REST_LOOK = 100  # periods between two looks whether it has
-STILL_STATE = 1e-7  # of the largest state: a change in one period that is none
 BROKEN = 1e9  # a state beyond it belongs to a plant that runs away
 CHANGE = 1e-6  # of a state or of an MV's range: for slopes
 REST_ITERATIONS = 12  # iterations
 BALANCED = 1e-6  # largest residual of a balance that was found
 LOCAL_GAIN_STEP = 0.02  # of an MV's range: for local gains
-# of a difference, over RESTING periods at its late rate: a CV that moves more does not settle
-NEVER_SETTLES = 0.2
 WEAK_SLOPE = 1e-7  # of the largest slope: a direction in which nothing is decided
 
 
@@ -39,13 +36,14 @@ def courses(plant: Simulator, x0: Array, mvs: Array, n: int, p: Array | None = N
 def settled(plant: Simulator, x0: Array, mvs: Array, p: Array | None = None) -> Array:
     """States (runs, n_x) after at most ``RESTING`` periods from x0 (n_x,) under constant mvs (runs, n_mv)."""
     advance = plant.many(len(mvs), p)
-    x = np.tile(x0, (len(mvs), 1))
-    for _ in range(RESTING // REST_LOOK):
+
+    def hold(x: Array) -> tuple[Array, Array]:
+        before = x
         for _ in range(REST_LOOK):
             before, x = x, _bounded(x, advance(x, mvs))
-        if np.max(np.abs(x - before)) <= STILL_STATE * max(float(np.max(np.abs(x))), 1.0):
-            break
-    return x
+        return x, np.abs(x - before)
+
+    return run_to_rest(hold, np.tile(x0, (len(mvs), 1)), RESTING // REST_LOOK, STILL_STATE, relative=True)[0]
 
 
 def answered(plant: Simulator, x0: Array, mvs: Array, n: int, p: Array | None = None) -> tuple[Array, Array]:
@@ -73,7 +71,7 @@ def local_gains(plant: Simulator, mv: int, places: Array, middle: Array, n_cv: i
     pairs[0, :, mv], pairs[1, :, mv] = places + size, places - size
     y = courses(plant, plant.start[0], pairs.reshape(-1, len(middle)), RESTING)[..., :n_cv]
     apart = (y[: len(places)] - y[len(places) :]) / (2 * size)  # (places, samples, n_cv)
-    late = (apart[:, -1] - apart[:, -RESTING // 4]) / (RESTING // 4 - 1)
+    late = late_slope(np.moveaxis(apart, 1, -1), RESTING // 4 - 1)
     moving = np.abs(late) * RESTING > NEVER_SETTLES * np.abs(apart[:, -1])
     return np.where(moving, late, apart[:, -1]), moving
 

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from loopwright.pipeline.dynamics.step_response import NOT_AT_REST
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.noise import coloured
@@ -24,7 +25,6 @@ MOVE_COST = 0.05  # share of the range of the controlled variable that a move ov
 MV_END_MARGIN = 0.1  # share of an MV's range that is left out at either end when set points are looked for
 MV_LOAD = 0.08  # of an MV's range: the steps of a load that acts with it
 DEVELOPMENT_REST = 1000  # samples to come to rest
-NOT_AT_REST = 0.01  # of the set point's range, over the last fifth of them: not at rest
 DRAWN = 8  # rests that are looked for, for each set point
 
 

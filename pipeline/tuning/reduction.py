@@ -10,6 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loopwright.pipeline.dynamics.step_response import CV_ANSWERED, first_change
 from loopwright.pipeline.errors import LawError, PlantError
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.plants.steady import Linearization
@@ -17,7 +18,6 @@ from loopwright.pipeline.plants.steady import Linearization
 RANK = 1e-8  # singular values of the Hankel matrix below this share of the largest are rounding
 NO_RESPONSE = 1e-14  # a largest one below this share of |C| |B| is nothing at all
 DIFFERENCE = 1e-4  # of a signal's size: the step of the central differences
-CV_ANSWERED = 1e-6  # of its largest move in a period: the CV has begun to answer
 LAG_OVERSHOOT = 0.02  # of its end, by which an answer swings beyond it: no lags do
 LONGEST_ANSWER = 20  # mean residence times in which an answer ends
 START_AT_REST = 1e-6  # of a state's size: what the start may move in one period and count as at rest
@@ -156,7 +156,7 @@ def start_lags(plant: Simulator) -> tuple[Linearization, float]:
     for _ in range(max(len(phi), int(LONGEST_ANSWER * time_s / h) + 1)):
         answers.append(float(c @ state))
         state = phi @ state
-    silent = int((np.abs(answers) > CV_ANSWERED * np.abs(answers).max()).argmax())
+    silent = int(first_change(np.array(answers), CV_ANSWERED))
     dead_s, seen_s = h * silent, time_s - _sum_of_two(variance, skew)
     # Less than half a period more is the sampling, or the error of a difference.
     if seen_s > dead_s + h / 2 and not (np.cumsum(answers) / gain).max() > 1 + LAG_OVERSHOOT:

@@ -9,16 +9,24 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.step_response import (
+    EVEN,
+    RAMP_SLOPE,
+    SETTLED_BAND,
+    STILL_RESPONSE,
+    answers_after,
+    late_distance,
+    late_slope,
+    ramp_delay,
+    settling_index,
+    starts_inverse,
+    two_point_lag,
+)
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.plants.simulator import Array, Simulator
 
 RESPONSE_STEP = 0.01  # of an MV's range
 SHORTEST_STEP_RUN, LONGEST_STEP_RUN = 100, 3200  # samples of a response
-STILL_RESPONSE = 0.01  # of its largest change, over its last fifth: a response that has settled
-EVEN = 0.05  # relative difference of two slopes that are the same
-RAMP_SLOPE = 0.5  # of a response's largest change, that its last slope makes over all of it: less is a creeping rest
-END_BAND = 0.05  # of the end
-ANSWERED_CHANGE = 0.1  # of the fastest change in a period
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +112,7 @@ class StepResponses:
         n = self.y.shape[-1]
         creeps = np.where(_settled(self.y), 0.0, _slopes(self.y)[-1])
         rests = (self.y + creeps[..., None] * (n - 1 - np.arange(n)))[self.slope == 0]
-        away = [np.flatnonzero(np.abs(y - y[-1]) > END_BAND * np.abs(y).max()) for y in rests if np.abs(y).max() > 0]
-        return max((int(at[-1]) + 2 for at in away if at.size), default=1 if len(rests) else 0)
+        return int(settling_index(rests, SETTLED_BAND * np.abs(rests).max(axis=1)).max()) + 1 if len(rests) else 0
 
     def crossing(self, width: Array) -> int:
         """Samples in which the strongest MV, over its range, carries each integrating CV across ``width`` (n_cv,).
@@ -119,59 +126,38 @@ class StepResponses:
     def answers_after(self, cv: int, mv: int) -> int:
         """Samples from the step to the first one at which the CV has answered: 1 without a dead time.
 
-        An answer is a change within a period of more than a tenth of the fastest.
+        An answer is a change within a period of more than a tenth of the fastest. It is 1 of an MV that moves nothing.
         """
-        change = np.abs(np.diff(self.y[cv, mv], prepend=0.0))
-        return int((change > ANSWERED_CHANGE * change.max()).argmax()) + 1
+        after = int(answers_after(self.y[cv, mv]))
+        return after if after <= self.y.shape[-1] else 1
 
     def starts_inverse(self, cv: int, mv: int) -> bool:
         """Whether the response first goes the other way, by more than a tenth of its end."""
-        y = self.y[cv, mv] * np.sign(self.gain[cv, mv])
-        return bool(y.min() < -ANSWERED_CHANGE * abs(y[-1]))
+        return starts_inverse(self.y[cv, mv] * np.sign(self.gain[cv, mv]))
 
     def process(self, cv: int, mv: int) -> FirstOrder:
-        """The lag with dead time through 28 % and 63 % of the response, or the ramp that an integrating one ends on.
-
-            tau = 1.5 (t63 - t28),  theta = t63 - tau;      integrating: theta = t_end - y_end / slope
+        """The lag of ``two_point_lag``, or the ramp that an integrating response ends on, with its ``ramp_delay``.
 
         Raises LawError where the MV does not act on the CV.
-
-        Source: Smith and Corripio, Principles and Practice of Automatic Process Control, section 7-2.3.
         """
         y, h, slope = self.y[cv, mv], self.period_s, float(self.slope[cv, mv])
         end = float(y[-1])
         if slope:
-            return FirstOrder(slope / h, inf, max(0.0, h * (len(y) - end / slope)))
+            return FirstOrder(slope / h, inf, max(0.0, h * ramp_delay(len(y), end, slope)))
         if not abs(end) > 1e-9 * float(np.abs(self.y).max()):
             raise LawError("the MV does not act on the controlled variable at rest; check the pairing")
-        t28, t63 = (h * reached(y / end, share) for share in (0.283, 0.632))
-        tau = max(1.5 * (t63 - t28), h / 2)
-        return FirstOrder(end / tau, tau, max(0.0, t63 - tau))
-
-
-def reached(rising: Array, share: float) -> float:
-    """Samples, between two where it lies there, until a response (n,) is at ``share`` > 0 for the first time.
-
-    It is 0 at the step, and its first value stands one sample later. One that never gets there gives n.
-    """
-    k = int((rising >= share).argmax())
-    if not rising[k] >= share:
-        return float(len(rising))
-    before = float(rising[k - 1]) if k else 0.0
-    return k + (share - before) / (float(rising[k]) - before)
+        tau, theta = two_point_lag(y / end, h)
+        return FirstOrder(end / tau, tau, theta)
 
 
 def _slopes(y: Array) -> Array:
     """Mean slopes (2, n_cv, n_mv) a period over the last but one and the last fifth of responses (n_cv, n_mv, n)."""
-    n = y.shape[-1]
-    a, b = n - 1 - 2 * (n // 5), n - 1 - n // 5
-    return np.stack([(y[..., b] - y[..., a]) / (b - a), (y[..., -1] - y[..., b]) / (n - 1 - b)])
+    n, fifth = y.shape[-1], y.shape[-1] // 5
+    return np.stack([late_slope(y[..., : n - fifth], fifth), late_slope(y, fifth)])
 
 
 def _settled(y: Array) -> NDArray[np.bool_]:
-    n = y.shape[-1]
-    moved = np.abs(y[..., n - 1 - n // 5 :] - y[..., -1:]).max(axis=-1)
-    return np.asarray(moved <= STILL_RESPONSE * np.abs(y).max(axis=-1))
+    return np.asarray(late_distance(y, y.shape[-1] // 5) <= STILL_RESPONSE * np.abs(y).max(axis=-1))
 
 
 def _known(y: Array, slope: Array) -> bool:

@@ -9,6 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from loopwright.pipeline.dynamics.step_response import (
+    BEGUN,
+    SETTLED_IN_HORIZON,
+    SLOPE_KEPT,
+    first_beyond,
+    settling_index,
+    slope_thirds,
+)
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Array
@@ -17,9 +25,7 @@ from loopwright.pipeline.plants.simulator import Array
 MV_LEVELS = (-0.8, -0.4, 0.0, 0.4, 0.8)  # of an MV in its range -1..1, the others in the middle of theirs
 LEVEL_STEP = 0.3  # of an MV, up and down
 LEVEL_SAMPLES, STEP_SAMPLES = 200, 150  # samples at each level, and after the step
-SETTLED_BAND = 0.1  # share of the whole answer within which it has settled
 LEAST_OUTPUT_ANSWER = 0.02  # share of the largest answer of an output; smaller ones have no settling time
-UNSETTLED_SLOPE = 0.9  # share of its slope before that an output keeps which never comes to rest
 TINY_SLOPE = 1e-12  # smallest slope that is divided by
 COVERED_STEPS = 0.9  # of the steps that the horizon is long enough for
 SHORTEST_CHOSEN, LONGEST_CHOSEN = 12, 50  # [samples] of a horizon that is chosen here
@@ -77,19 +83,17 @@ def step_responses(model: Identified, mv_of: Callable[[Tensor], Tensor]) -> Arra
 
 
 def settling_times(responses: Array) -> Array:
-    """Samples (answers,) until each answer stays within SETTLED_BAND of its end, of responses (runs, n, n_y).
+    """Samples (answers,) until each answer stays within 10 % of its end, of responses (runs, n, n_y).
 
     An output that a step hardly moves has no answer. One that goes on and on, as a level, settles twice as late as it
     first moves as fast as later on: so long it takes to set it moving, and to stop it.
     """
-    change = responses[:, -1] - responses[:, 0]  # (runs, n_y)
-    away = np.abs(responses - responses[:, -1:]) > SETTLED_BAND * np.abs(change)[:, None]
-    last = np.where(away, np.arange(responses.shape[1])[:, None], -1).max(axis=1) + 1
-    slope = np.abs(np.diff(responses, axis=1))  # (runs, n - 1, n_y)
-    begun, middle, end = (np.median(part, axis=1) for part in np.array_split(slope, 3, axis=1))
-    goes_on = np.median(end / np.maximum(middle, TINY_SLOPE), axis=0) > UNSETTLED_SLOPE  # (n_y,)
-    moving = 2 * (slope >= (1 - SETTLED_BAND) * begun[:, None]).argmax(axis=1) + 2
-    found = np.where(goes_on, moving, last)
+    y = np.moveaxis(responses, 1, -1)  # (runs, n_y, n)
+    change, slope = y[..., -1] - y[..., 0], np.abs(np.diff(y))
+    begun, middle, end = slope_thirds(slope)
+    goes_on = np.median(end / np.maximum(middle, TINY_SLOPE), axis=0) > SLOPE_KEPT  # (n_y,)
+    moving = 2 * (slope >= (1 - SETTLED_IN_HORIZON) * begun[..., None]).argmax(axis=-1) + 2
+    found = np.where(goes_on, moving, settling_index(y, SETTLED_IN_HORIZON * np.abs(change)))
     return np.asarray(found[np.abs(change) > LEAST_OUTPUT_ANSWER * np.abs(change).max(axis=0)], dtype=np.float64)
 
 
@@ -111,7 +115,6 @@ def refuse_unstable(model: Identified) -> None:
 
 
 # ------------------------------------------------------------------------------------------------ reach of the horizon
-BEGUN = 0.01  # share of the change within STEP_SAMPLES samples, from which an answer has begun
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +160,6 @@ class Sight:
 def _first(y: Array) -> int:
     """The first sample in which an output answers to any step, of responses (runs, n)."""
     moved = np.abs(y - y[:, :1])
-    change = moved.max(axis=1, keepdims=True)
-    clear = (moved > BEGUN * change) & (change >= LEAST_OUTPUT_ANSWER * change.max()) & (change > 0)
-    return int(np.argmax(clear.any(axis=0))) if clear.any() else STEP_SAMPLES + 1
+    change = moved.max(axis=1)
+    clear = (change >= LEAST_OUTPUT_ANSWER * change.max()) & (change > 0)
+    return int(first_beyond(moved[clear], BEGUN * change[clear]).min()) if clear.any() else STEP_SAMPLES + 1

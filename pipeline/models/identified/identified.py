@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from loopwright.pipeline.dynamics.step_response import answers_after
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.steady_states import central_map, rest_map
 from loopwright.pipeline.plants.simulator import Array
-from loopwright.pipeline.tuning.responses import ANSWERED_CHANGE
 
 
 class Identified(Model):
@@ -186,9 +186,8 @@ def dead_periods(model: Dynamics, data: ScaledRecord, length: int = 60) -> Array
     start = central_map(model, data) @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
     size = 0.5 * data.v.std(axis=0)
     response = step_responses(model, start, middle, size, length)[..., : data.y.shape[1]]
-    change = np.abs(np.diff(response, axis=1, prepend=0.0))
-    answers = change > ANSWERED_CHANGE * change.max(axis=1, keepdims=True)
-    return np.asarray(answers.any(axis=2).argmax(axis=1), dtype=np.float64)
+    silent = answers_after(np.moveaxis(response, 1, -1)).min(axis=1) - 1
+    return np.where(silent < length, silent, 0).astype(np.float64)
 
 
 def step_responses(model: Dynamics, x: Array, v: Array, size: Array, length: int) -> Array:

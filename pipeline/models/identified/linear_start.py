@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.step_response import VISIBLE_CHANGE, first_change
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
@@ -193,12 +194,9 @@ def dead_times(response: Array, weight: Array) -> list[int]:
     Visible is what exceeds a sixth of the response's largest value at one of the outputs. The estimate only
     offers a candidate: a held-out error decides for it or for none.
     """
-    size = np.abs(response * weight)
-    visible = size > size.max(axis=0) / 6
     # An output that an input does not move at all says nothing of its dead time.
-    moved = size.max(axis=0) > 0
-    first = np.where(moved, visible.argmax(axis=0), len(size)).min(axis=0)
-    return [max(int(d) - 1, 0) if any_moved else 0 for d, any_moved in zip(first, moved.any(axis=0), strict=True)]
+    first = first_change(np.moveaxis(response * weight, 0, -1), VISIBLE_CHANGE).min(axis=0)
+    return [max(int(d) - 1, 0) if d < len(response) else 0 for d in first]
 
 
 # --------------------------------------------------------------------------------- an ARX of few lags as a state space

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from loopwright.pipeline.dynamics.step_response import reached
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.candidates import FitTask
@@ -16,7 +17,6 @@ from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_search import LinearSearch
 from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.structure import CandidateFits, Problem, Structure
-from loopwright.pipeline.tuning.responses import reached
 
 LINEAR_ITERATIONS = 20
 """Iterations of a linear fit."""

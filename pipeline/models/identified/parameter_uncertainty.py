@@ -7,17 +7,14 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from loopwright.pipeline.dynamics.step_response import GOES_ON, late_change, reached
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.output_error import residuals, sensitivity_sums
 from loopwright.pipeline.plants.simulator import Array
-from loopwright.pipeline.tuning.responses import reached
 
 TIME_CONSTANT_RISES = (0.1, 0.63)
 """Shares of its last value between which the time of a step response is its time constant; the first ends dead time."""
-
-GOES_ON = 0.1
-"""Share of its last value that an answer gains in its last fifth, from which it goes on; a ramp gains a fifth."""
 
 OFTEN = 0.1
 """Share of the members whose answers go on, above which all are taken so."""
@@ -48,8 +45,8 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
     gain, pace, dead = np.zeros(n_mv), np.zeros(n_mv), np.zeros(n_mv)
     for j in range(n_mv):
         found = _strongest(curves[:, j])
-        late = found[:, -max(found.shape[1] // 5, 1)]
-        if np.mean(np.abs(found[:, -1] - late) > GOES_ON * np.abs(found[:, -1])) > OFTEN:
+        late = late_change(found, max(found.shape[1] // 5, 1) - 1)
+        if np.mean(np.abs(late) > GOES_ON * np.abs(found[:, -1])) > OFTEN:
             found = _strongest(curves[:, j, :MOST_PERIODS])  # another output may be moved most by then
         middle = float(np.median(found[:, -1]))
         if len(found) < 2 or middle == 0.0:

@@ -8,6 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from loopwright.pipeline.dynamics.steady_state import (
+    HELD_PERIODS,
+    MOST_REST_PERIODS,
+    STANDS_STILL,
+    STILL_SCALED,
+    STILL_WITHIN,
+    run_to_rest,
+)
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
@@ -19,12 +27,8 @@ INTEGRATES = 0.999
 DIRECTION_STEP, DIRECTION_PERIODS = 1e-3, 300
 """Step of an input, scaled, and the periods after it, in which a model that integrates shows which way it goes."""
 
-SOUGHT_RESTS = 200  # rows whose rests are sought
-MOST_REST_PERIODS = 3000
-"""Rests that the map is fitted to, and the most periods in which one is reached."""
-
-STILL_WITHIN = 1e3
-"""Scaled state, hidden ones included, beyond which a model has not come to rest."""
+SOUGHT_RESTS = 200
+"""Rows whose rests are sought, which the map is fitted to."""
 
 LOADED_DEVIATION = 0.25
 """Deviation of the outputs, scaled, that loads add to the rests."""
@@ -40,11 +44,9 @@ def settle(
 ) -> tuple[Array, Array]:
     """(states (n, n_x), whether each stands still (n,)) after a free run under constant inputs v (n, n_v)."""
     x = np.zeros((len(v), model.n_x)) if start is None else np.array(start)
-    for _ in range(0, periods, 50):
-        x, moved = model.hold(x, v, 50)
-        if not np.any(moved > 1e-7):
-            break
-    still = (moved < 1e-5) & (np.abs(x).max(axis=1) < STILL_WITHIN)
+    looks = -(-periods // HELD_PERIODS)
+    x, moved = run_to_rest(lambda at: model.hold(at, v, HELD_PERIODS), x, looks, STILL_SCALED)
+    still = (moved < STANDS_STILL) & (np.abs(x).max(axis=1) < STILL_WITHIN)
     return x, still
 
 

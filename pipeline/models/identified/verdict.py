@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.dynamics.step_response import STILL_CURVE, late_change, late_slope
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.metrics import fit_percent
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
@@ -180,7 +181,7 @@ def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_]
                     step_responses(model, x[at], v[at], 1e-3 * np.ones(n_v), DIRECTION_PERIODS)[j, :, :n_y] / 1e-3
                 )
                 rates[j, q] = (
-                    np.abs(response[-1] - response[-1 - SLOPE_PERIODS]) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
+                    np.abs(late_change(response.T, SLOPE_PERIODS)) > 1e-3 * np.abs(response).max(axis=0) + 1e-9
                 )
                 end = (
                     int(
@@ -190,9 +191,7 @@ def gains(model: Dynamics, data: ScaledRecord) -> tuple[Array, NDArray[np.bool_]
                     )
                     - 1
                 )
-                found[j, q] = np.where(
-                    rates[j, q], (response[end] - response[end - SLOPE_PERIODS]) / SLOPE_PERIODS, response[-1]
-                )
+                found[j, q] = np.where(rates[j, q], late_slope(response[: end + 1].T, SLOPE_PERIODS), response[-1])
             else:
                 found[j, q] = gain[at, :n_y, j]
     return found, rates, float(radius.max())
@@ -244,8 +243,8 @@ def response_curves(members: Sequence[Dynamics], data: ScaledRecord) -> Array:
     while True:
         runs = [step_responses(m, x, middle, size, length)[..., :n_y] for m, x in zip(members, rests, strict=True)]
         found = np.array(runs)
-        late = np.abs(found[:, :, -1] - found[:, :, -length // 5]).max()
-        if length >= LONGEST_RESPONSE or late < 0.02 * np.abs(found).max():
+        late = np.abs(late_change(np.moveaxis(found, 2, -1), length // 5 - 1)).max()
+        if length >= LONGEST_RESPONSE or late < STILL_CURVE * np.abs(found).max():
             return found
         length *= 2
 
