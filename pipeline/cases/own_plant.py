@@ -84,6 +84,11 @@ class OwnCase(OwnEnsemble):
         return self.signals.sp[0].unit if len(self.signals.sp) == 1 else PERCENT
 
     @property
+    def travel_in_shares(self) -> bool:
+        """Whether the MVs' travel counts in % of their ranges: where the errors do, and where the MVs' units differ."""
+        return len(self.signals.sp) > 1 or super().travel_in_shares
+
+    @property
     def settling_s(self) -> float:
         """A set point lasts so many times as long, within limits."""
         return self.hold / ANSWERS_A_SET_POINT * self.signals.period_s
@@ -109,8 +114,8 @@ class OwnCase(OwnEnsemble):
         n = len(signals)
         if n == 1:
             return super().score(test, pv, mv)
-        spans, moves = _spans(signals), _spans(self.signals.mv)
-        shares = (100 * test.sp / spans, 100 * pv[:, :n] / spans, 100 * mv / moves)
+        spans = _spans(signals)
+        shares = (100 * test.sp / spans, 100 * pv[:, :n] / spans, self.mv_shares(mv))
         small = 100 * self.spans / spans
         figures = closed_loop_metrics(*shares, test.hold, self.signals.period_s, small, test.late_from)
         return figures | {mae_of(s): mae(test.sp[:, i], pv[:, i]) for i, s in enumerate(signals)}

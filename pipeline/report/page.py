@@ -10,6 +10,7 @@ from typing import Any
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import lock_up_text
 from loopwright.pipeline.evaluation.leaderboard import because, by_reason
+from loopwright.pipeline.evaluation.metric import TRAVEL
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
 from loopwright.pipeline.evaluation.validation import FILE, reference_words
 from loopwright.pipeline.evaluation.verdicts import Claims
@@ -264,7 +265,7 @@ def over_old_loop(evidence: Evidence, law: str) -> list[tuple[str, str]]:
     (first, where), *rest = words
     further = "".join(f"; {abs(share):.0f} % {_less(share)} on {test}" for share, test in rest)
     moved = (*evidence.daily, evidence.main_test)[0]
-    own, other = (evidence.figure(name, moved, "mv_travel") for name in (law, old))
+    own, other = (evidence.figure(name, moved, TRAVEL) for name in (law, old))
     travel = (
         f". Its MV travel is {number(own / other)} times the old loop's on {names(moved)}"
         if own is not None and other
