@@ -9,6 +9,7 @@ from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from loopwright.pipeline.engine.run_mark import runs_here
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant, longest_memory
@@ -27,6 +28,7 @@ MODEL_ARRAYS = (
 )
 
 VISITED = 2.0  # standard deviations of an output in the record
+MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 
 
 class Doubts(NamedTuple):
@@ -199,6 +201,14 @@ class Untrained(Simulator):
 
     @property
     def _error(self) -> PlantError:
-        return PlantError(
-            f"{self.needs} holds no model; `loopwright run {self.name}` trains the models of the plant first"
-        )
+        return PlantError(f"{self.needs} holds no model; {to_train(self.name)}")
+
+
+def to_train(plant: str) -> str:
+    """A clause for a person without the models of a plant: run it, or wait for the run that is under way."""
+    if not runs_here():
+        return f"`loopwright run {plant}` trains the models of the plant first"
+    return (
+        f"a run is under way in this folder: its stage `fit {plant}-{MODEL_SET}` trains them, so wait for its end; if "
+        f"that run is of another plant, `loopwright run {plant}` comes after it"
+    )

@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT
-from loopwright.pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
+from loopwright.pipeline.cases.own_ensemble import OwnEnsemble
 from loopwright.pipeline.cases.own_entries import OLD_LOOP
-from loopwright.pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
+from loopwright.pipeline.cases.own_model import MODEL_SET, OwnPlant, Untrained, errors_of, lessened
 from loopwright.pipeline.cases.own_tests import (
     LEAST_DAILY_ROWS,
     course,
