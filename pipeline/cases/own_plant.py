@@ -14,7 +14,7 @@ import numpy as np
 from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT
 from loopwright.pipeline.cases.own_ensemble import OwnEnsemble
 from loopwright.pipeline.cases.own_entries import OLD_LOOP
-from loopwright.pipeline.cases.own_model import MODEL_SET, OwnPlant, Untrained, errors_of, lessened
+from loopwright.pipeline.cases.own_model import MODEL_SET, GoneWrong, OwnPlant, Untrained, errors_of
 from loopwright.pipeline.cases.own_tests import (
     LEAST_DAILY_ROWS,
     course,
@@ -163,7 +163,7 @@ class OwnCase(OwnEnsemble):
         spoilt = [self._spoilt(p, s, of) for (s, p), of in zip(pairs, cycle(errors), strict=False)]
         upwards = [(p, up) for (_, p), up in zip(pairs, cycle((True, False)), strict=False)]
         less = sorted({share for _, share in spoilt if share < 1})
-        title = f"Set points, on such models gone wrong: {self._doubts}"
+        title = f"Set points, on such models gone wrong: {'; or '.join(map(str, errors))}"
         if less:
             count = sum(share < 1 for _, share in spoilt)
             title += (
@@ -178,7 +178,7 @@ class OwnCase(OwnEnsemble):
             **self._daily(members),
         }
 
-    def _spoilt(self, plant: OwnPlant, seed: int, errors: Mapping[str, float]) -> tuple[Scenario, float]:
+    def _spoilt(self, plant: OwnPlant, seed: int, wrong: GoneWrong) -> tuple[Scenario, float]:
         """The test on a plant gone wrong, and the share of the errors: the largest that can be controlled.
 
         The plant then rests at each set point, does not run away under an MV at its end, and a control that knows it
@@ -187,9 +187,9 @@ class OwnCase(OwnEnsemble):
         """
         whole: Scenario | None = None
         for share in ERROR_SHARES:
-            of = lessened(errors, share)
+            of = wrong.lessened(share).parameters
             sp, rests = self.reach.drawn(plant, seed, plant.parameters(of))
-            test = self._test("spoilt", "", sp, plant, seed, of)
+            test = replace(self._test("spoilt", "", sp, plant, seed, of), kind=wrong.kind)
             whole = whole or test
             if rests and self.reach.stays(plant, plant.parameters(of)) and gets_there(plant, test):
                 return test, share
@@ -293,7 +293,7 @@ class OwnCase(OwnEnsemble):
         """
         plant, first = self._nominal, self.development_seeds[:1]
         drawn = [(s, dict[str, float]()) for s in self.development_seeds]
-        drawn += [(s, e) for s in first for e in errors_of(plant)]
+        drawn += [(s, dict(wrong.parameters)) for s in first for wrong in errors_of(plant)]
         return tuple(
             self._test("development", "Development", self.reach.set_points(plant, s, plant.parameters(e)), plant, s, e)
             for s, e in drawn

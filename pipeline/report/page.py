@@ -19,6 +19,7 @@ from loopwright.pipeline.pictures.drawing import CasePicture
 from loopwright.pipeline.pictures.numbers import number, ratio
 from loopwright.pipeline.pictures.words import law_name, scenario_name
 from loopwright.pipeline.report.figures import draw_all, main_words
+from loopwright.pipeline.report.gone_wrong import dead_time_to_state, wrong_rows
 from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from loopwright.pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
 from loopwright.pipeline.report.own_acceptance import against, beyond_reach, shipped_laws, step_test_to_run
@@ -114,6 +115,8 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "baseline": law_name(case.baseline),
         "laws": [law_row(evidence, law) for law in evidence.laws],
         "scenarios": scenario_rows(evidence),
+        "gone_wrong": wrong_rows(evidence),
+        "late": [words for law in shipped if (words := dead_time_to_state(evidence, law))],
         "further": further_figures(evidence),
         "analyses": analyses(evidence),
         "bound_notes": _bound_notes(evidence),
