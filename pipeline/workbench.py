@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from loopwright.pipeline.cases.own_ensemble import LAW_PART
-from loopwright.pipeline.cases.own_model import MODEL_ARRAYS, OwnPlant
+from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_ARRAYS, OwnPlant
 from loopwright.pipeline.config.exports import ExportParams
 from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.config.params import choose, parse

@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from loopwright.pipeline.cases.operating_range import Reach, visited_mv
-from loopwright.pipeline.cases.own_model import MODEL_ARRAYS, Doubts, OwnPlant, doubted, suits
+from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_ARRAYS, MODEL_SET, Doubts, OwnPlant, doubted, suits
 from loopwright.pipeline.config.exports import is_exported
 from loopwright.pipeline.errors import ModelError, PlantError, RecordError
 from loopwright.pipeline.evaluation.case import Array, Case
@@ -24,7 +24,6 @@ from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.records.record_file import RecordedSetPoints
 from loopwright.pipeline.simulation.rests import answered
 
-MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
 CURVE_MV_VALUES = 101  # values of an MV over its range at which the models' turns are sought: 1 % apart
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from loopwright.pipeline.cases.own_ensemble import LAW_PART, MODEL_SET
+from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_SET
 from loopwright.pipeline.config.exports import ExportParams, screened_record
 from loopwright.pipeline.records.old_loops import OldController
 

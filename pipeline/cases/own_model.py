@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
+from loopwright.pipeline.engine.run_mark import runs_here
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant, longest_memory
 from loopwright.pipeline.plants.noise import deviation
 from loopwright.pipeline.plants.perturbed import SpoiltPlant, likely_error
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
+from loopwright.pipeline.simulation.scenario import Scenario
 
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
 LEAST_GAIN_ERROR, LEAST_PACE_ERROR, LEAST_DEAD_ERROR = 0.25, 0.25, 1.0
@@ -26,6 +28,7 @@ MODEL_ARRAYS = (
     *("noise", "colour", "dv_noise", "gain_sd", "pace_sd", "dead_sd"),
 )
 
+MODEL_SET = LAW_PART = "identified"  # the model that laws are designed on
 VISITED = 2.0  # standard deviations of an output in the record
 
 
@@ -47,12 +50,58 @@ class Doubts(NamedTuple):
         dead = likely_error(arrays["dead_sd"], LEAST_DEAD_ERROR, MOST_DEAD_ERROR)
         return cls(tuple(map(float, gain)), float(pace[0]), float(dead[0]))
 
+
+# Kinds of plants gone wrong. The last one stands for the dead times that explain the record as the model's does: a
+# model with one has about the same gain and pace.
+SLOW, FAST, LATE = "slow", "fast", "late alone"
+
+
+@dataclass(frozen=True, slots=True)
+class GoneWrong:
+    """A plant gone wrong: its kind, and its parameters, gains and time constant as factors, dead time in periods."""
+
+    kind: str
+    parameters: Mapping[str, float]
+
+    @classmethod
+    def on(cls, test: Scenario) -> Self:
+        """The plant of a test on one."""
+        names = ("time_constant", "dead_time")
+        own = {k: float(v[0]) for k, v in test.changes.items() if k in names or k.startswith("gain_")}
+        return cls(test.kind, own)
+
+    @property
+    def as_likely(self) -> Self:
+        """The same kind with errors that are together as likely as one of them alone: n errors by 1/sqrt(n) each.
+
+        Independent errors of k standard deviations each are together sqrt(n) k from none. Whole ones all at once are a
+        plant that hardly comes about, and rank laws otherwise than plants do that changed (docs/benchmarks.md).
+        """
+        gains = {k: v for k, v in self.parameters.items() if k.startswith("gain_")}
+        wrong = (
+            any(v != 1 for v in gains.values()),
+            self.parameters["time_constant"] != 1,
+            self.parameters["dead_time"] != 0,
+        )
+        return self.lessened(1 / np.sqrt(max(sum(wrong), 1)))
+
+    def lessened(self, share: float) -> Self:
+        """The same kind, gone wrong by a share of these errors: factors to its power, dead times times it."""
+        less = {k: v * share if k == "dead_time" else v**share for k, v in self.parameters.items()}
+        return replace(self, parameters=less)
+
     def __str__(self) -> str:
         """In words."""
-        gain = " to ".join(f"{g:g}" for g in sorted({round(1 + g, 2) for g in (min(self.gain), max(self.gain))}))
-        slow = f"gain {gain} times as high, {1 + self.pace:.3g} times as slow, {_periods(LEAST_DEAD_ERROR)} later"
-        farthest = f"; or else as the model, {_periods(self.dead)} later" * (self.dead > LEAST_DEAD_ERROR)
-        return f"{slow}; or lower and faster by as much{farthest}"
+        of = dict(self.parameters)
+        later, pace = of.pop("dead_time"), of.pop("time_constant")
+        factors = sorted({round(gain if pace >= 1 else 1 / gain, 2) for gain in (min(of.values()), max(of.values()))})
+        gain = " to ".join(f"{factor:g}" for factor in factors)
+        words = {
+            SLOW: f"gain {gain} times as high, {pace:.3g} times as slow",
+            FAST: f"gain {gain} times as low, {1 / pace:.3g} times as fast",
+            LATE: "as the model",
+        }[self.kind]
+        return f"{self.kind}: {words}" + (f", {later:.2g} period{'s' * (later != 1)} later" if later else "")
 
 
 class OwnPlant(IdentifiedPlant):
@@ -133,33 +182,23 @@ class OwnPlant(IdentifiedPlant):
 
     def variations(self) -> tuple[Simulator, ...]:
         """The model itself, and with errors of gain, speed and dead time."""
-        return (self, *(SpoiltPlant(self, errors) for errors in errors_of(self)))
+        return (self, *(SpoiltPlant(self, wrong.parameters) for wrong in errors_of(self)))
 
 
-def errors_of(plant: OwnPlant) -> list[dict[str, float]]:
-    """Parameters of the spoilt plants: slow and late with a high gain; fast with a low gain; and late alone.
+def errors_of(plant: OwnPlant) -> list[GoneWrong]:
+    """The plants gone wrong: slow and late with a high gain; fast with a low gain; and late alone.
 
-    The last one stands for the dead times that explain the record as the model's does: a model with one has about the
-    same gain and pace. There is none where they end within ``LEAST_DEAD_ERROR``.
+    There is none of the last kind where the dead times end within ``LEAST_DEAD_ERROR``.
     """
     d = plant.doubts
     high = {f"gain_{s.name}": 1 + error for s, error in zip(plant.mv_signals, d.gain, strict=True)}
+    low, same = {name: 1 / gain for name, gain in high.items()}, dict.fromkeys(high, 1.0)
     found = [
-        {**high, "time_constant": 1 + d.pace, "dead_time": LEAST_DEAD_ERROR},
-        {**{name: 1 / gain for name, gain in high.items()}, "time_constant": 1 / (1 + d.pace), "dead_time": 0.0},
+        GoneWrong(SLOW, {**high, "time_constant": 1 + d.pace, "dead_time": LEAST_DEAD_ERROR}),
+        GoneWrong(FAST, {**low, "time_constant": 1 / (1 + d.pace), "dead_time": 0.0}),
     ]
-    late = dict.fromkeys(high, 1.0) | {"time_constant": 1.0, "dead_time": d.dead}
+    late = GoneWrong(LATE, {**same, "time_constant": 1.0, "dead_time": d.dead})
     return [*found, late] if d.dead > LEAST_DEAD_ERROR else found
-
-
-def _periods(count: float) -> str:
-    """A number of periods."""
-    return f"{count:.2g} period{'s' * (count != 1)}"
-
-
-def lessened(errors: Mapping[str, float], share: float) -> dict[str, float]:
-    """Parameters of a plant that is spoilt by a share of these errors: factors to its power, dead times times it."""
-    return {name: value * share if name == "dead_time" else value**share for name, value in errors.items()}
 
 
 def doubted(plant: OwnPlant, doubts: Doubts) -> dict[str, tuple[float, float]]:
@@ -199,6 +238,14 @@ class Untrained(Simulator):
 
     @property
     def _error(self) -> PlantError:
-        return PlantError(
-            f"{self.needs} holds no model; `loopwright run {self.name}` trains the models of the plant first"
-        )
+        return PlantError(f"{self.needs} holds no model; {to_train(self.name)}")
+
+
+def to_train(plant: str) -> str:
+    """A clause for a person without the models of a plant: run it, or wait for the run that is under way."""
+    if not runs_here():
+        return f"`loopwright run {plant}` trains the models of the plant first"
+    return (
+        f"a run is under way in this folder: its stage `fit {plant}-{MODEL_SET}` trains them, so wait for its end; if "
+        f"that run is of another plant, `loopwright run {plant}` comes after it"
+    )

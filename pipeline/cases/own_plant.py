@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT
-from loopwright.pipeline.cases.own_ensemble import MODEL_SET, OwnEnsemble
+from loopwright.pipeline.cases.own_ensemble import OwnEnsemble
 from loopwright.pipeline.cases.own_entries import OLD_LOOP
-from loopwright.pipeline.cases.own_model import OwnPlant, Untrained, errors_of, lessened
+from loopwright.pipeline.cases.own_model import MODEL_SET, GoneWrong, OwnPlant, Untrained, errors_of
 from loopwright.pipeline.cases.own_tests import (
     LEAST_DAILY_ROWS,
     course,
@@ -84,6 +84,11 @@ class OwnCase(OwnEnsemble):
         return self.signals.sp[0].unit if len(self.signals.sp) == 1 else PERCENT
 
     @property
+    def travel_in_shares(self) -> bool:
+        """Whether the MVs' travel counts in % of their ranges: where the errors do, and where the MVs' units differ."""
+        return len(self.signals.sp) > 1 or super().travel_in_shares
+
+    @property
     def settling_s(self) -> float:
         """A set point lasts so many times as long, within limits."""
         return self.hold / ANSWERS_A_SET_POINT * self.signals.period_s
@@ -109,8 +114,8 @@ class OwnCase(OwnEnsemble):
         n = len(signals)
         if n == 1:
             return super().score(test, pv, mv)
-        spans, moves = _spans(signals), _spans(self.signals.mv)
-        shares = (100 * test.sp / spans, 100 * pv[:, :n] / spans, 100 * mv / moves)
+        spans = _spans(signals)
+        shares = (100 * test.sp / spans, 100 * pv[:, :n] / spans, self.mv_shares(mv))
         small = 100 * self.spans / spans
         figures = closed_loop_metrics(*shares, test.hold, self.signals.period_s, small, test.late_from)
         return figures | {mae_of(s): mae(test.sp[:, i], pv[:, i]) for i, s in enumerate(signals)}
@@ -154,11 +159,11 @@ class OwnCase(OwnEnsemble):
     @cached_property
     def _scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         members, pairs = self.members, self._pairs
-        errors = errors_of(self._nominal)
+        errors = [wrong.as_likely for wrong in errors_of(self._nominal)]
         spoilt = [self._spoilt(p, s, of) for (s, p), of in zip(pairs, cycle(errors), strict=False)]
         upwards = [(p, up) for (_, p), up in zip(pairs, cycle((True, False)), strict=False)]
         less = sorted({share for _, share in spoilt if share < 1})
-        title = f"Set points, on such models gone wrong: {self._doubts}"
+        title = f"Set points, on such models gone wrong: {'; or '.join(map(str, errors))}"
         if less:
             count = sum(share < 1 for _, share in spoilt)
             title += (
@@ -173,7 +178,7 @@ class OwnCase(OwnEnsemble):
             **self._daily(members),
         }
 
-    def _spoilt(self, plant: OwnPlant, seed: int, errors: Mapping[str, float]) -> tuple[Scenario, float]:
+    def _spoilt(self, plant: OwnPlant, seed: int, wrong: GoneWrong) -> tuple[Scenario, float]:
         """The test on a plant gone wrong, and the share of the errors: the largest that can be controlled.
 
         The plant then rests at each set point, does not run away under an MV at its end, and a control that knows it
@@ -182,9 +187,9 @@ class OwnCase(OwnEnsemble):
         """
         whole: Scenario | None = None
         for share in ERROR_SHARES:
-            of = lessened(errors, share)
+            of = wrong.lessened(share).parameters
             sp, rests = self.reach.drawn(plant, seed, plant.parameters(of))
-            test = self._test("spoilt", "", sp, plant, seed, of)
+            test = replace(self._test("spoilt", "", sp, plant, seed, of), kind=wrong.kind)
             whole = whole or test
             if rests and self.reach.stays(plant, plant.parameters(of)) and gets_there(plant, test):
                 return test, share
@@ -288,7 +293,7 @@ class OwnCase(OwnEnsemble):
         """
         plant, first = self._nominal, self.development_seeds[:1]
         drawn = [(s, dict[str, float]()) for s in self.development_seeds]
-        drawn += [(s, e) for s in first for e in errors_of(plant)]
+        drawn += [(s, dict(wrong.parameters)) for s in first for wrong in errors_of(plant)]
         return tuple(
             self._test("development", "Development", self.reach.set_points(plant, s, plant.parameters(e)), plant, s, e)
             for s, e in drawn

@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from pathlib import Path
 
+from loopwright.pipeline.config.params import PARAMS_FILE, sections
+from loopwright.pipeline.engine.run_mark import runs_here
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.plants.simulator import Simulator
+from loopwright.pipeline.stages.paths import ARTIFACTS
 from loopwright.serving.manifest import Manifest
 
 
@@ -54,3 +58,24 @@ def require_made_for(manifest: Manifest, plant: Simulator) -> None:
         raise ParamsError(
             f"the controller's period is {manifest.period_s} s, but plant {plant.name!r} has {plant.period_s}"
         )
+
+
+def require_shipped(file: Path) -> None:
+    """Raise ParamsError where a case is named in a controller's place, or its controller is not there.
+
+    It says whether a run has to be begun, or to end.
+    """
+    case = file.parent.name if file.parent.parent == ARTIFACTS else str(file)
+    if file.exists() or not Path(PARAMS_FILE).is_file() or case not in sections("cases"):
+        return
+    law = file.stem if file.parent.name == case else "LAW"
+    when = (
+        f"a run is under way in this folder, and its stage `validate {case}-{law}` makes it"
+        if runs_here()
+        else f"`loopwright run {case}` makes it"
+    )
+    if law == "LAW":
+        raise ParamsError(
+            f"{case} is no controller's file; give {ARTIFACTS / case}/LAW.onnx; where there is none, {when}"
+        )
+    raise ParamsError(f"{file} is not there yet; {when}, unless the law is not shipped")

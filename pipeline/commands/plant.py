@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from loopwright.pipeline.cases import CASES, all_cases
+from loopwright.pipeline.cases.own_model import to_train
 from loopwright.pipeline.commands.arguments import positive, whole
 from loopwright.pipeline.config.params import choose
 from loopwright.pipeline.errors import PipelineError, PlantError
@@ -48,9 +49,7 @@ def start_of(case: Case) -> tuple[Array, Array]:
         test = next(iter(case.scenarios().values()))[0]
         return test.x0, test.mv0
     if not case.ready:
-        raise PlantError(
-            f"{case.name} has no model to serve yet, or one of an earlier record; `loopwright run {case.name}` makes it"
-        )
+        raise PlantError(f"{case.name} has no model to serve yet, or one of an earlier record; {to_train(case.name)}")
     if case.stand_in == IDENTIFIED:
         print(
             f"{case.name}: this is the model that was identified from the record, the one that its controllers were "

@@ -17,6 +17,7 @@ from loopwright.pipeline.config.params import entries, sections, sections_of
 from loopwright.pipeline.engine.cluster import STAGES as KINDS
 from loopwright.pipeline.engine.dvc import affected, ask, ask_in_turn, environment
 from loopwright.pipeline.engine.parent_death import end_with_parent, hear_no_interrupt
+from loopwright.pipeline.engine.run_mark import run_marked
 from loopwright.pipeline.errors import ParamsError, PipelineError, nearest
 from loopwright.pipeline.report.results import show_results, without_controller
 from loopwright.pipeline.stages.check import mistakes
@@ -79,7 +80,10 @@ def _run(options: argparse.Namespace) -> int:
     print("\n".join(plan(changed, len(expected))), flush=True)
     if options.dry:
         return 0
-    code = repro(targets, changed, expected, keep_going=options.keep_going) if changed else 0
+    code = 0
+    if changed:
+        with run_marked():
+            code = repro(targets, changed, expected, keep_going=options.keep_going)
     if code == 0:
         # Somebody who asked for one case need not look for it in the table of all.
         asked = options.targets if targets and all(t.startswith("report@") for t in targets) else [None]

@@ -13,7 +13,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from loopwright.pipeline.cases import PLANTS, all_cases
-from loopwright.pipeline.commands.arguments import positive, real, require_made_for, whole
+from loopwright.pipeline.commands.arguments import positive, real, require_made_for, require_shipped, whole
 from loopwright.pipeline.config.params import choose
 from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.evaluation.case import Case
@@ -76,6 +76,7 @@ def run(options: argparse.Namespace) -> None:
     """Run the loop, live, and leave a picture."""
     if options.sp and options.scenario is not None:
         raise ParamsError("give set points or a scenario, not both")
+    require_shipped(options.file)
     controller = Controller(options.file)
     plant, case = _plant_of(controller.manifest)
     course = timetable(

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from loopwright.pipeline.cases import all_cases
-from loopwright.pipeline.commands.arguments import real, require_made_for, whole
+from loopwright.pipeline.cases.own_model import to_train
+from loopwright.pipeline.commands.arguments import real, require_made_for, require_shipped, whole
 from loopwright.pipeline.engine.cluster import address, workers_here
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import ParamsError, nearest
@@ -49,6 +50,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the loops and write their report; or one of them again."""
+    require_shipped(options.file)
     manifest, content = opened(options.file)
     case = _case_of(manifest)
     drawing = Drawing(case, options.seed, options.spread / 100, options.faults / 100)
@@ -126,7 +128,7 @@ def _case_of(manifest: Manifest) -> Case:
         )
     case = cases[manifest.case]
     if not case.ready:
-        raise ParamsError(f"{case.name} has no models yet; `loopwright run {case.name}` trains them")
+        raise ParamsError(f"{case.name} has no models yet; {to_train(case.name)}")
     require_made_for(manifest, case.plant)
     return case
 

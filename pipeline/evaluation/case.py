@@ -18,7 +18,7 @@ from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
 from loopwright.pipeline.evaluation.evidence_basis import RecordVerdict
-from loopwright.pipeline.evaluation.metric import METRICS, Metric
+from loopwright.pipeline.evaluation.metric import METRICS, TRAVEL, Metric
 from loopwright.pipeline.metrics import rmse
 from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Signals, Simulator
@@ -28,6 +28,8 @@ from loopwright.pipeline.simulation.scenario import Scenario
 Array = NDArray[np.float64]
 Setting = Mapping[str, float | str]
 """The parameters in which a variant differs from the shipped law."""
+SHARES_OF_RANGES = "% of ranges"
+"""The unit of the travel of MVs whose own units differ."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,8 +259,15 @@ class Case(ABC):
 
     @cached_property
     def metrics(self) -> Mapping[str, Metric]:
-        """Every metric of the case by its name: the common ones, and its own."""
-        return METRICS | {metric.name: metric for metric in self.own_metrics}
+        """Every metric of the case by its name: the common ones, that of the MVs' travel in its unit, and its own."""
+        mv = self.plant_class.mv_signals[0].unit
+        travel = replace(METRICS[TRAVEL], unit=SHARES_OF_RANGES if self.travel_in_shares else mv)
+        return METRICS | {travel.name: travel} | {metric.name: metric for metric in self.own_metrics}
+
+    @property
+    def travel_in_shares(self) -> bool:
+        """Whether the MVs' travel counts in % of their ranges: a sum of their own units would mean nothing."""
+        return len({s.unit for s in self.plant_class.mv_signals}) > 1
 
     @property
     def criterion(self) -> Metric:
@@ -290,13 +299,18 @@ class Case(ABC):
         """The case scored on other held-out sequences."""
         return replace(self, held_out_seeds=seeds)
 
+    def mv_shares(self, mv: Array) -> Array:
+        """MVs (n, n_mv) in % of the widths of their ranges."""
+        return 100 * mv / np.array([s.high - s.low for s in self.plant.mv_signals])
+
     def score(self, test: Scenario, pv: Array, mv: Array) -> dict[str, float]:
         """Figures of one closed loop from the noise-free process variables pv (n, n_pv) and mv (n, n_mv).
 
         A case with more figures than ``closed_loop_metrics`` adds its own.
         """
         span = self.spans[0]
-        figures = closed_loop_metrics(test.sp, pv, mv, test.hold, self.plant.period_s, span, test.late_from)
+        moved = self.mv_shares(mv) if self.travel_in_shares else mv
+        figures = closed_loop_metrics(test.sp, pv, moved, test.hold, self.plant.period_s, span, test.late_from)
         if test.reference is not None:
             figures["tracking"] = rmse(test.reference, pv[:, : test.reference.shape[1]])
         return figures

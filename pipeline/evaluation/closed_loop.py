@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopwright.pipeline.dynamics.step_response import settled_index
-from loopwright.pipeline.evaluation.metric import METRICS
+from loopwright.pipeline.evaluation.metric import METRICS, TRAVEL
 from loopwright.pipeline.metrics import errors, ise, mv_travel
 
 Array = NDArray[np.float64]
@@ -191,7 +191,8 @@ def closed_loop_metrics(
         Controlled variables without measurement noise, the same shape; further columns (other
         measured states) are ignored.
     mv
-        Manipulated variables, shape (n,) or (n, n_mv).
+        Manipulated variables, shape (n,) or (n, n_mv); of different units as shares of their ranges, because their
+        travel is summed.
     hold
         Samples per set point; 0 where it never moves.
     period_s
@@ -235,7 +236,7 @@ def closed_loop_metrics(
         ],
     }
     figures = {name: float(np.max(v) if METRICS[name].together == "max" else np.mean(v)) for name, v in loops.items()}
-    figures["mv_travel"] = mv_travel(u)
+    figures[TRAVEL] = mv_travel(u)
     if late_from:
         figures["sse_late"] = float(np.mean([sse_late(a, b, late_from) for a, b in pairs]))
     return figures

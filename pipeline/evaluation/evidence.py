@@ -263,10 +263,14 @@ class Evidence:
         Errors up to ``ALIKE_ERRORS`` times the lowest do not say which law is better: data seeds differ by as much. The
         best of such laws is the one whose MVs travel least there. A law that locked up on one of them, or that is not
         shipped, is left out. So is one that does not beat the loop that the plant was run by before, there, in each
-        test and where the record is replayed: this much of a say the scored tests have. Without development figures the
-        gate score decides.
+        test and where the record is replayed. Where the tests run on models, a law that swings to the end in any of
+        them comes behind those that do not: its plant may be one of these models, and then it is worse than any figure
+        says. This much of a say the scored tests have. Without development figures the gate score decides.
         """
         scores = self._candidates
+        if self.case.on_models:
+            calm = {n: e for n, e in scores.items() if not self.laws[n].metrics.swings}
+            scores = calm or scores
         alike = [n for n in scores if scores[n] <= ALIKE_ERRORS * min(scores.values())]
         return min(alike, key=lambda n: (self.laws[n].development_travel, scores[n]), default=None)
 

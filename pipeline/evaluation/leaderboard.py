@@ -11,7 +11,7 @@ from typing import Self
 
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.law_evidence import lock_up_text
-from loopwright.pipeline.evaluation.metric import gate_ratio, ratio_to_bound
+from loopwright.pipeline.evaluation.metric import TRAVEL, gate_ratio, ratio_to_bound
 from loopwright.pipeline.evaluation.validation import FILE, CheckedStatement, Validation
 from loopwright.pipeline.files import read_json
 from loopwright.pipeline.simulation import NOISE_SUFFIX
@@ -32,6 +32,7 @@ class LawStanding:
     ratio: float | None  # ``CaseStanding.times``, or to the noise floor if the bound is less: ``CaseStanding.hidden``
     step_us: float | None
     bytes: int | None  # size of the controller file
+    travel: float | None = None  # of the MVs, as ``CaseStanding.travel`` says
     swings: str = ""  # the tests in which a closed loop swings to the end
 
 
@@ -55,6 +56,8 @@ class CaseStanding:
     reproduced: tuple[int, int]  # figures of the paper's tables: number reproduced, number measured
     grounds: Grounds | None = None  # what tests on models of the plant's record rest on
     times: str = "× NMPC"  # what ratios are to
+    travel: str = ""  # of the MVs on that test, words and unit; empty where its unit is not known
+    travel_bound: float | None = None  # of the perfect-model NMPC
     old_loop: str = ""  # the law that the plant was run by before
     over_old_loop: Mapping[str, float] = field(default_factory=dict)  # test -> 1 - best law's figure / old loop's
 
@@ -91,6 +94,8 @@ class CaseStanding:
             reproduced=(sum(judged), len(judged)),
             grounds=validation.grounds,
             times=validation.gate.times,
+            travel=validation.travel_words,
+            travel_bound=validation.bounds.get(test, {}).get("nmpc", {}).get(TRAVEL),
             old_loop=validation.old_loop,
             over_old_loop=_over_old_loop(validation),
         )
@@ -171,5 +176,6 @@ def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
         ratio=_ratio(validation, row.get(metric)),
         step_us=result.step_us,
         bytes=file.stat().st_size if file.exists() else None,
+        travel=row.get(TRAVEL) if validation.travel_words else None,
         swings=lock_up_text(result.swings),
     )

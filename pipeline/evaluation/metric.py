@@ -22,6 +22,8 @@ REDUCE: Mapping[How, Callable[[Iterable[float]], float]] = {
 }
 NO_UNIT = frozenset({"", "-", "1"})
 """Units of a signal that is a plain number."""
+TRAVEL = "mv_travel"
+"""The figure of how far the MVs go in a loop, whose unit a case states: see ``Case.metrics``."""
 DRAW_SEEDS = 1_000  # added to the noise's seed for every further draw of it
 
 
@@ -118,7 +120,7 @@ METRICS: dict[str, Metric] = {
         Metric("max_asse", "MaxASSE", "largest absolute steady-state error", "{cv}", "max"),
         Metric("overshoot", "overshoot", "mean overshoot of the steps"),
         Metric("settling", "settling time", "median settling time", "s"),
-        Metric("mv_travel", "MV travel", "travel of the MVs"),
+        Metric(TRAVEL, "MV travel", "travel of the MVs"),
         # Of a PID's analysis.
         Metric("kc", "Kc", "gain of the PID, ideal form, in units of MV and CV"),
         Metric("ti_s", "Ti", "integral time of the PID", "s"),

@@ -167,7 +167,7 @@ def _sign(pv: str, mv: str, found: Mapping[str, Any], proof: Mapping[str, Any]) 
         limit = "certain in sign, the same in both halves of the record, and of the size that one-step predictions find"
         because = LITTLE if little else OLD_LOOP if held else _word(found, known, holds=holds) or _why(pv, mv, found)
     return CheckedStatement(
-        f"model, answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
+        f"model, gain on the way: answer of {pv} to {mv} {found['first']} to {found['last']} periods after a step of 1",
         limit,
         "; ".join([*([] if by_region else [_measured(found)]), *_regions(mv, found)]),
         holds,
@@ -272,9 +272,9 @@ def known_rows(models: Mapping[str, Metrics]) -> list[CheckedStatement]:
     rows = []
     for of in _statements(identified_part(models).get("proof") or {}):
         used = "gain" in of
-        measured = f"model {of['gain']:.3g} ± {of['spread']:.2g}" if used else "not compared"
+        measured = f"model, at the middle, {of['gain']:.3g} ± {of['spread']:.2g}" if used else "not compared"
         if used and of["direct"] is not None:
-            measured += f"; one-step predictions, on the way there, {of['direct']:.3g} ± {of['sd']:.2g}"
+            measured += f"; one-step predictions, on the way, {of['direct']:.3g} ± {of['sd']:.2g}"
         rows.append(
             CheckedStatement(
                 f"what is known of the answer of {of['pv']} to {of['input']}",

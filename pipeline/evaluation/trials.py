@@ -19,7 +19,7 @@ from loopwright.pipeline.evaluation.closed_loop import STEP_BAND, last_half, lef
 from loopwright.pipeline.evaluation.extrapolation import reached_by, widest
 from loopwright.pipeline.evaluation.knowing_control import reached
 from loopwright.pipeline.evaluation.law_evidence import BASE, Cycle
-from loopwright.pipeline.evaluation.metric import DRAW_SEEDS, mean_of_draws, together
+from loopwright.pipeline.evaluation.metric import DRAW_SEEDS, TRAVEL, mean_of_draws, together
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
@@ -343,7 +343,7 @@ class Trials:
             metrics,
             sequences,
             self.case.developed([row[self.case.metric] for row in developed]),
-            statistics.fmean(row["mv_travel"] for row in developed) if developed else math.nan,
+            statistics.fmean(row[TRAVEL] for row in developed) if developed else math.nan,
             {name: count for name, count in locked_up.items() if count},
             {name: count for name, count in swings.items() if count},
             {name: count for name, count in beyond.items() if count},

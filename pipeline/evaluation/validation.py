@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.law_evidence import FormAnalysis, Row
+from loopwright.pipeline.evaluation.metric import TRAVEL
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 
 VALIDATION_SCHEMA = 1
@@ -112,7 +113,7 @@ class GateRecord:
 
 @dataclass(frozen=True, slots=True)
 class Titles:
-    """Words for a person: of the case, of its metric and its unit, of its own figures, of laws and tests."""
+    """Words for a person: of the case, of its metric and its unit, of travel and its own figures, of laws and tests."""
 
     case: str
     metric: str
@@ -167,6 +168,11 @@ class Validation:
         """Figure -> words and unit: the metric of each of several CVs, whose shares of ranges make up ``metric``."""
         figures = self.titles.figures.items() if self.on_models else ()
         return {name: words for name, words in figures if name.startswith(f"{self.metric}_")}
+
+    @property
+    def travel_words(self) -> str:
+        """Words and unit of the MVs' travel; empty in a file of an older release, which may sum unlike units."""
+        return self.titles.figures.get(TRAVEL, "")
 
     def floor(self, test: str) -> float:
         """The error that noise can hide in a test; ``test`` has no noise suffix."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from loopwright.pipeline.cases.own_model import LATE, GoneWrong
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.model_evidence import identified_part
 from loopwright.pipeline.files import read_json
@@ -175,11 +176,41 @@ def _dead_times(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
         f"from {number(low)} to {number(high)} s of {name} (the model has {number(own)} s)"
         for name, (own, low, high) in wide.items()
     )
-    pairs = " and ".join(f'--known "{signal.name}/{next(iter(wide))}=dead 30..50"' for signal in plant.sp_signals)
     return (
-        f"Dead times {' and '.join(spans)} explain the record alike. If you know the true one, say it in seconds, as "
-        f"{pairs} or in column `known` of the table of tags: the controllers can then be quicker.",
+        f"Dead times {' and '.join(spans)} explain the record alike. If you know the true one, "
+        f"{say_dead_times(evidence)}: the controllers can then be quicker.",
     )
+
+
+def say_dead_times(evidence: Evidence) -> str:
+    """How an engineer states the dead times that the record leaves open, each pair with their ends [s], a clause.
+
+    Where a record in open loop names none, these ends lie after the model's dead time by what its tests go wrong by.
+    """
+    plant, period_s = evidence.case.plant_class, evidence.case.plant_class.period_s
+    part = identified_part(evidence.models)
+    found = (part.get("open") or {}).get("dead_times") or {}
+    ends = {name: (low, high) for name, (_, low, high) in found.items() if high - low >= APART}
+    if not ends:
+        own, later = part.get("dead_times") or {}, max(_later(evidence), default=0.0)
+        first = {s.name: own.get(s.name) or 0.0 for s in plant.mv_signals}
+        ends = {name: (periods, periods + later) for name, periods in first.items()}
+    pairs = " ".join(
+        f'--known "{pv.name}/{name}=dead {period_s * low:.4g}..{period_s * high:.4g}"'
+        for name, (low, high) in ends.items()
+        for pv in plant.sp_signals
+    )
+    return (
+        f"say it in seconds, as near as you know it within these ends: {pairs} of `loopwright new`, or column `known` "
+        "of the table of tags"
+    )
+
+
+def _later(evidence: Evidence) -> list[float]:
+    """Dead times [periods] by which plants gone wrong are late alone."""
+    tests = evidence.case.tests()
+    wrong = (test for name in evidence.case.gone_wrong for test in tests.get(name, ()))
+    return [GoneWrong.on(test).parameters["dead_time"] for test in wrong if test.kind == LATE]
 
 
 def _noisy_disturbances(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:

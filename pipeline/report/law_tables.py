@@ -6,8 +6,7 @@ from typing import Any
 
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import BASE
-from loopwright.pipeline.evaluation.metric import NO_UNIT
-from loopwright.pipeline.pictures.drawing import axis_label
+from loopwright.pipeline.evaluation.metric import TRAVEL, with_unit
 from loopwright.pipeline.pictures.words import given_text
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
@@ -34,20 +33,21 @@ def scenario_rows(evidence: Evidence) -> list[dict[str, Any]]:
         rows.append(_row(evidence, name, title, case.metric))
         if late_s := evidence.late_s(name):
             rows.append(_row(evidence, name, f"{title}, from {late_s:g} s on", case.criterion.late))
-    mv, *others = case.plant_class.mv_signals
-    together = case.cv_unit if len(case.plant_class.sp_signals) > 1 else ""  # with several CVs all are shares of ranges
-    unit = axis_label(", all MVs together", together) if others else "" if mv.unit in NO_UNIT else f" [{mv.unit}]"
-    travel = [_row(evidence, evidence.main_test, f"MV travel{unit}: {evidence.main_title}", "mv_travel")]
-    if case.on_models:  # a person compares it with the old loop, whose record has another length
-        travel += [_row(evidence, name, evidence.scenarios[name], "mv_travel") for name in evidence.daily]
-        travel = [_a_minute(evidence, mv.unit if not others else together, row) for row in travel]
+    of = case.metrics[TRAVEL]
+    words, unit = of.short + ", all MVs together" * (len(case.plant_class.mv_signals) > 1), of.unit_of(case.cv_unit)
+    # In a minute a person compares it with the old loop, whose record has another length.
+    per = "" if not case.on_models else "1/min" if not unit else f"{unit} a minute" if " " in unit else f"{unit}/min"
+    shown = with_unit(words, per or unit)
+    names = (evidence.main_test, *(evidence.daily if case.on_models else ()))
+    titles = {name: evidence.scenarios[name.removesuffix(NOISE_SUFFIX)] for name in names}
+    travel = [_row(evidence, name, f"{shown}: {title}", TRAVEL) for name, title in titles.items()]
+    travel = [_a_minute(evidence, row) if per else row for row in travel]
     return [*rows, *(row | {"winner": None} for row in travel)]
 
 
-def _a_minute(evidence: Evidence, unit: str, row: dict[str, Any]) -> dict[str, Any]:
-    """The row of the MVs' travel, in a minute of the test: [unit/min]."""
-    bare = str(row["name"]).removesuffix(NOISE_SUFFIX)
-    tests = evidence.tests[bare]
+def _a_minute(evidence: Evidence, row: dict[str, Any]) -> dict[str, Any]:
+    """The row of the MVs' travel, in a minute of the test."""
+    tests = evidence.tests[str(row["name"]).removesuffix(NOISE_SUFFIX)]
     minutes = sum(len(test.sp) for test in tests) / len(tests) * evidence.case.plant.period_s / 60.0
 
     def each(value: float | None) -> float | None:
@@ -55,10 +55,7 @@ def _a_minute(evidence: Evidence, unit: str, row: dict[str, Any]) -> dict[str, A
 
     cells = {law: {key: each(value) for key, value in cell.items()} for law, cell in row["cells"].items()}
     bounds = {key: each(row[key]) for key in ("nmpc", "nmpc_noise", "offline")}
-    words = "MV travel" + ", all MVs together" * (len(evidence.case.plant_class.mv_signals) > 1)
-    own = unit.replace("deg", "°")
-    per = "1/min" if unit in NO_UNIT else f"{own} a minute" if " " in own else f"{own}/min"
-    return row | bounds | {"cells": cells, "title": f"{words} [{per}]: {evidence.scenarios[bare]}"}
+    return row | bounds | {"cells": cells}
 
 
 def further_figures(evidence: Evidence) -> list[dict[str, Any]]:

@@ -18,6 +18,7 @@ from loopwright.pipeline.historian.step_test import ALONE, HOLD_SETTLINGS, LARGE
 from loopwright.pipeline.pictures.drawing import axis_label
 from loopwright.pipeline.pictures.numbers import number, times
 from loopwright.pipeline.pictures.words import law_name, scenario_name
+from loopwright.pipeline.report.gone_wrong import dead_time_to_state
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 
@@ -82,7 +83,7 @@ def against(evidence: Evidence) -> list[dict[str, str]]:
     for law in shipped_laws(evidence):
         clauses = []
         if worse := worse_tests(evidence, law):
-            each = ", ".join(_words(evidence, one) for one in worse)
+            each = ", ".join(_words(evidence, law, one) for one in worse)
             clauses.append(f"has a higher {case.criterion.short} than the {law_name(case.baseline)} in {each}")
         if swings := evidence.laws[law].metrics.swings:
             worst = worst_cycle(evidence, law)
@@ -106,9 +107,17 @@ def beyond_reach(evidence: Evidence) -> list[str]:
     ]
 
 
-def _words(evidence: Evidence, one: Worse) -> str:
+def _words(evidence: Evidence, law: str, one: Worse) -> str:
     unit = f" {evidence.case.unit}".rstrip()
-    return f"{one.test} (× {one.factor:.3g}: {number(one.own)}{unit} against {number(one.limit)}{unit})"
+    remedy = _remedy(evidence, law, one.test)
+    return f"{one.test} (× {one.factor:.3g}: {number(one.own)}{unit} against {number(one.limit)}{unit}{remedy})"
+
+
+def _remedy(evidence: Evidence, law: str, test: str) -> str:
+    """The remedy for a law in a test on plants gone wrong, after a semicolon; empty where none is known."""
+    wrong = test.removesuffix(NOISE_SUFFIX) in evidence.case.gone_wrong
+    words = dead_time_to_state(evidence, law) if wrong else ""
+    return f"; {words}" if words else ""
 
 
 UNMEASURED = "not measured"
@@ -231,7 +240,7 @@ def _beside(evidence: Evidence, law: str, baseline: str) -> Iterator[CheckedStat
             f"{evidence.case.criterion.short} ≤ {_with_unit(evidence, limit)}",
             _with_unit(evidence, own),
             own <= limit,
-            hidden if other < floor else "",
+            hidden if other < floor else "" if own <= limit else _remedy(evidence, law, test).removeprefix("; "),
         )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import lock_up_text
 from loopwright.pipeline.evaluation.leaderboard import because, by_reason
+from loopwright.pipeline.evaluation.metric import TRAVEL
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED, candidates, model_rows
 from loopwright.pipeline.evaluation.validation import FILE, reference_words
 from loopwright.pipeline.evaluation.verdicts import Claims
@@ -18,6 +19,7 @@ from loopwright.pipeline.pictures.drawing import CasePicture
 from loopwright.pipeline.pictures.numbers import number, ratio
 from loopwright.pipeline.pictures.words import law_name, scenario_name
 from loopwright.pipeline.report.figures import draw_all, main_words
+from loopwright.pipeline.report.gone_wrong import dead_time_to_state, wrong_rows
 from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from loopwright.pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
 from loopwright.pipeline.report.own_acceptance import against, beyond_reach, shipped_laws, step_test_to_run
@@ -113,6 +115,8 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "baseline": law_name(case.baseline),
         "laws": [law_row(evidence, law) for law in evidence.laws],
         "scenarios": scenario_rows(evidence),
+        "gone_wrong": wrong_rows(evidence),
+        "late": [words for law in shipped if (words := dead_time_to_state(evidence, law))],
         "further": further_figures(evidence),
         "analyses": analyses(evidence),
         "bound_notes": _bound_notes(evidence),
@@ -264,7 +268,7 @@ def over_old_loop(evidence: Evidence, law: str) -> list[tuple[str, str]]:
     (first, where), *rest = words
     further = "".join(f"; {abs(share):.0f} % {_less(share)} on {test}" for share, test in rest)
     moved = (*evidence.daily, evidence.main_test)[0]
-    own, other = (evidence.figure(name, moved, "mv_travel") for name in (law, old))
+    own, other = (evidence.figure(name, moved, TRAVEL) for name in (law, old))
     travel = (
         f". Its MV travel is {number(own / other)} times the old loop's on {names(moved)}"
         if own is not None and other

@@ -8,6 +8,7 @@ from typing import Any
 from loopwright.pipeline.evaluation.case import Curve, PaperFigure, PaperTable, Requirement
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import LawEvidence, Row
+from loopwright.pipeline.evaluation.metric import TRAVEL
 from loopwright.pipeline.evaluation.validation import (
     CheckedStatement,
     GateRecord,
@@ -165,7 +166,7 @@ def validation(evidence: Evidence, judged: Judged) -> Validation:
             case=case.title,
             metric=case.criterion.long,
             metric_short=case.criterion.short,
-            figures={metric.name: metric.label(case.cv_unit) for metric in case.own_metrics},
+            figures={metric.name: metric.label(case.cv_unit) for metric in (case.metrics[TRAVEL], *case.own_metrics)},
             laws={name: law.title for name, law in evidence.laws.items()},
             scenarios=evidence.scenarios,
             unit=case.unit,

@@ -37,6 +37,7 @@ class Scenario:
     plant: Simulator | None = None  # what the test runs on, where that is not the case's plant
     reference: Array | None = None  # (n, 1) what the CV should do, where that is not to be at its set point at once
     replayed: bool = False  # a record's own course, with its noise in it: no noise is added, and no bound computed
+    kind: str = ""  # of the plant gone wrong that it runs on
     dv: Array | None = None  # (n, n_dv) measured disturbances at every sample; None: they stay at the plant's own
 
     def __post_init__(self) -> None:

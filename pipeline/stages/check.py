@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from loopwright.pipeline.cases import all_cases
-from loopwright.pipeline.cases.own_ensemble import LAW_PART, MEMBERS, MODEL_SET, OwnEnsemble
+from loopwright.pipeline.cases.own_ensemble import MEMBERS, OwnEnsemble
+from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_SET
 from loopwright.pipeline.config.exports import ExportParams, is_exported, screened_record
 from loopwright.pipeline.config.params import (
     CaseParams,

@@ -291,9 +291,6 @@ def _evidence(case: Case, base: list[Trial], shipped: Trial, grounds: Grounds | 
     names = dict.fromkeys(name for row in figures.values() for name in row)
     units = {n: unit for n in names if (unit := case.metrics[n.removesuffix("_median")].unit_of(case.cv_unit))}
     units |= {"overshoot": "of the step"} if "overshoot" in names else {}
-    mvs = case.plant_class.mv_signals
-    if "mv_travel" in names and (len(mvs) == 1 or case.cv_unit == "% of range"):
-        units["mv_travel"] = mvs[0].unit if len(mvs) == 1 and case.cv_unit != "% of range" else "% of ranges"
     return {"seeds": len(base), "lock_ups": sum(t.lock_ups for t in base), **of, "units": units, "scenarios": figures}
 
 

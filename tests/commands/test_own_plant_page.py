@@ -62,3 +62,12 @@ def test_each_doubt_that_the_page_explains_is_one_that_new_can_print() -> None:
     parts = [part.strip(" ,)") for row in rows for part in re.split(r"\.\.\.|;", row)]
     assert len(rows) == 13
     assert [part for part in parts if part and part not in source] == []
+
+
+def test_each_gain_that_is_told_of_a_pair_has_the_name_that_the_glossary_explains() -> None:
+    (row,) = re.findall(r"^\| gain \|(.*)\|$", PAGE, re.MULTILINE)
+    names = [name.lower() for name in re.findall(r"\*([^*]+)\*", row)]
+    assert names == ["by one linear model", "at the middle", "on the way"]
+    files = ("report/screening.py", "report/identified_model.py", "evaluation/proof.py")
+    source = [(ROOT / "pipeline" / file).read_text(encoding="utf-8").lower() for file in files]
+    assert [name in text for name, text in zip(names, source, strict=True)] == [True] * 3

@@ -39,7 +39,7 @@ def test_without_a_model_a_line_says_what_to_do(tmp_path: Path, monkeypatch: pyt
     case = controllers_of_a_lag({})
     for path in Path("work").rglob("*.npz"):
         path.unlink()
-    with pytest.raises(PlantError, match=f"`loopwright run {case.name}` makes it"):
+    with pytest.raises(PlantError, match=f"`loopwright run {case.name}` trains"):
         start_of(type(case)(case.held_out_seeds))
 
 

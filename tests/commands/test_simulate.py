@@ -6,6 +6,7 @@ import csv
 import io
 import subprocess
 import sys
+from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
@@ -18,6 +19,7 @@ from rich.live import Live
 from loopwright.pipeline import commands
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.engine.run_mark import run_marked
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
@@ -260,3 +262,16 @@ def test_sparkline() -> None:
     assert sparkline(np.linspace(0, 1, 8), 0, 1) == "▁▂▃▄▅▆▇█"
     assert sparkline(np.array([-9.0, 9.0, np.nan]), 0, 1) == "▁█▁"
     assert len(sparkline(np.zeros(500), 0, 1, width=60)) == 60
+
+
+@pytest.mark.parametrize(("given", "under_way"), [("mill", False), ("mill", True), ("artifacts/mill/pid.onnx", True)])
+def test_a_controller_that_no_run_has_made_yet_is_told_with_the_run_that_makes_it(
+    given: str, under_way: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("params.yaml").write_text("cases: {mill: {}}\n")
+    with run_marked() if under_way else nullcontext():
+        assert main(["simulate", given]) == 2
+    said = capsys.readouterr().err
+    assert ("a run is under way" in said) is under_way
+    assert ("`loopwright run mill`" in said) is not under_way
+    assert len(said.splitlines()) == 1

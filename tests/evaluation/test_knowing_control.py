@@ -11,7 +11,7 @@ import pytest
 from own_cases import controllers_of_a_lag, filled_level, two_lags
 
 from loopwright.pipeline.cases import own_plant
-from loopwright.pipeline.cases.own_model import lessened
+from loopwright.pipeline.cases.own_model import SLOW, GoneWrong
 from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.evaluation.knowing_control import gets_there, reached
 from loopwright.pipeline.evaluation.trials import close_loop, repeated, seized
@@ -132,8 +132,8 @@ def test_errors_that_no_control_copes_with_are_lessened_and_the_title_says_so(
 
 def test_a_share_of_errors() -> None:
     errors = {"gain_u": 4.0, "time_constant": 0.25, "dead_time": 3.0}
-    assert lessened(errors, 0.5) == {"gain_u": 2.0, "time_constant": 0.5, "dead_time": 1.5}
-    assert lessened(errors, 1.0) == errors
+    assert GoneWrong(SLOW, errors).lessened(0.5).parameters == {"gain_u": 2.0, "time_constant": 0.5, "dead_time": 1.5}
+    assert GoneWrong(SLOW, errors).lessened(1.0).parameters == errors
 
 
 def test_set_points_say_whether_the_plant_rests_at_each(monkeypatch: pytest.MonkeyPatch) -> None:
