@@ -83,7 +83,7 @@ class FitTask:
     """A fit of a structure on a fold: ``iterations`` more from ``begun``.
 
     Without ``begun`` a balanced candidate starts from ``start``, a lagged one from its least squares; a network from
-    the linear model ``base``, its units drawn with ``seed``.
+    the linear model ``base``, its units drawn with ``seed``. ``last`` is false where a later round trains it on.
     """
 
     structure: Structure
@@ -93,12 +93,14 @@ class FitTask:
     start: FoldStart | None = None
     base: Fitted | None = None
     begun: Fitted | None = None
+    last: bool = True
 
 
 def fit_candidate(problem: Problem, task: FitTask) -> Fitted | str:
     """The fitted candidate; the reason where the data cannot carry it.
 
-    A network that explodes or swings under constant inputs, where the plant settles, counts as exploded.
+    A network that explodes or swings under constant inputs, where the plant settles, counts as exploded, or before
+    the last round as ``wild``: after few iterations hardly any comes to rest, and training may tame it.
     """
     noise, network = task.structure.noise != "none", task.structure.n_hidden > 0
     kinds = {(False, False): _linear, (False, True): _network, (True, False): _with_noise, (True, True): _bent}
@@ -106,8 +108,8 @@ def fit_candidate(problem: Problem, task: FitTask) -> Fitted | str:
         fitted = kinds[noise, network](problem, task)
     except ModelError as error:
         return str(error)
-    if network and problem.settles and wild(fitted.model.plant, problem):
-        fitted = replace(fitted, held_out=np.inf)
+    swings = network and problem.settles and wild(fitted.model.plant, problem)
+    fitted = replace(fitted, held_out=np.inf) if swings and task.last else replace(fitted, wild=swings)
     return _beside_what_is_known(problem, fitted)
 
 

@@ -120,10 +120,10 @@ class NetworkSearch:
         offers = self.rounds.affordable(offers, QUICK_SEEDS[0] * (BEGINNING + SHORT_ITERATIONS), 0.4)
         cost = sum(self.rounds.budget.of(s, BEGINNING + SHORT_ITERATIONS) for s in offers)
         seeds = int(np.clip(self.rounds.budget.left(0.25) / cost, *QUICK_SEEDS))
-        tasks = [self._task(s, 0, seed, SHORT_ITERATIONS) for s in offers for seed in range(seeds)]
+        tasks = [replace(self._task(s, 0, seed, SHORT_ITERATIONS), last=False) for s in offers for seed in range(seeds)]
         quick = _ranked(self.rounds.trials(tasks, "neural networks, first training")[0])
         second = [
-            self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE_ITERATIONS, t)
+            replace(self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE_ITERATIONS, t), last=False)
             for t in quick[:SECOND_CANDIDATES]
             for ridge in RIDGES
             for k in self._folds
@@ -177,13 +177,13 @@ class NetworkSearch:
 def _ranked(trials: Sequence[CandidateFits]) -> list[CandidateFits]:
     """Trials of the first fold by their better seed, exploded ones left out."""
     finite = [t for t in trials if np.isfinite(t.of_fold(0)[0].held_out)]
-    return sorted(finite, key=lambda t: (t.against, t.of_fold(0)[0].held_out))
+    return sorted(finite, key=lambda t: (t.against, t.wild, t.of_fold(0)[0].held_out))
 
 
 def _seed(trial: CandidateFits) -> int:
     """The seed of a trial's best fit on its first fold; 0 without one."""
-    first = [(f.held_out, seed) for (fold, seed), f in trial.fits.items() if fold == 0]
-    return min(first)[1] if first else 0
+    first = [(f.wild, f.held_out, seed) for (fold, seed), f in trial.fits.items() if fold == 0]
+    return min(first)[-1] if first else 0
 
 
 def _offers(linear: Sequence[Structure], units: Sequence[int]) -> list[Structure]:

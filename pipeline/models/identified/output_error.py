@@ -207,6 +207,7 @@ class Fitted:
     """A fitted model, the initial states of its training stretches, and its errors (scaled, over all outputs).
 
     ``against`` are the pairs of output and input whose gain contradicts what is known of them, see ``Knowledge``.
+    ``wild`` is a network that does not settle where the plant does, in a round that goes on.
     """
 
     model: Dynamics
@@ -215,6 +216,7 @@ class Fitted:
     held_out: float
     work: int  # iterations that led here
     against: frozenset[int] = frozenset()
+    wild: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)

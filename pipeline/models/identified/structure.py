@@ -140,10 +140,12 @@ class CandidateFits:
         """The fits of one fold, the best first.
 
         Held-out and training rows count alike: few held-out rows flatter a seed that missed others. Those that
-        contradict what is known of the plant come after these, and last those that exploded.
+        contradict what is known of the plant come after these, then wild ones, and last those that exploded.
         """
         own = (f for (of, _), f in self.fits.items() if of == fold)
-        return sorted(own, key=lambda f: (not np.isfinite(f.held_out), bool(f.against), f.held_out**2 + f.trained**2))
+        return sorted(
+            own, key=lambda f: (not np.isfinite(f.held_out), f.wild, bool(f.against), f.held_out**2 + f.trained**2)
+        )
 
     @property
     def against(self) -> int:
@@ -155,9 +157,15 @@ class CandidateFits:
         return sum(bool(of) and all(of) for of in finite)
 
     @property
-    def rank(self) -> tuple[int, float]:
-        """Key by which candidates are sorted: contradictions of knowledge first, then the error."""
-        return self.against, self.error
+    def wild(self) -> int:
+        """The folds of which no fit settles."""
+        finite = [[f.wild for f in self.of_fold(k) if np.isfinite(f.held_out)] for k in self.folds]
+        return sum(bool(of) and all(of) for of in finite)
+
+    @property
+    def rank(self) -> tuple[int, int, float]:
+        """Key by which candidates are sorted: contradictions of knowledge first, then the wild ones, then the error."""
+        return self.against, self.wild, self.error
 
     @property
     def error(self) -> float:
