@@ -83,7 +83,7 @@ class GoneWrong:
             self.parameters["time_constant"] != 1,
             self.parameters["dead_time"] != 0,
         )
-        return self.lessened(1 / np.sqrt(max(sum(wrong), 1)))
+        return self.lessened(max(sum(wrong), 1) ** -0.5)
 
     def lessened(self, share: float) -> Self:
         """The same kind, gone wrong by a share of these errors: factors to its power, dead times times it."""
@@ -93,7 +93,7 @@ class GoneWrong:
     def __str__(self) -> str:
         """In words."""
         of = dict(self.parameters)
-        later, pace = of.pop("dead_time"), of.pop("time_constant")
+        later, pace = float(of.pop("dead_time")), float(of.pop("time_constant"))
         factors = sorted({round(gain if pace >= 1 else 1 / gain, 2) for gain in (min(of.values()), max(of.values()))})
         gain = " to ".join(f"{factor:g}" for factor in factors)
         words = {

@@ -160,7 +160,11 @@ class OwnCase(OwnEnsemble):
     def _scenarios(self) -> dict[str, tuple[Scenario, ...]]:
         members, pairs = self.members, self._pairs
         errors = [wrong.as_likely for wrong in errors_of(self._nominal)]
-        spoilt = [self._spoilt(p, s, of) for (s, p), of in zip(pairs, cycle(errors), strict=False)]
+        # Each kind meets another model in the next round: with as many kinds as models it would meet one alone.
+        rounds = [(i + i // len(errors)) % len(members) for i in range(len(pairs))]
+        spoilt = [
+            self._spoilt(members[at], s, of) for at, (s, _), of in zip(rounds, pairs, cycle(errors), strict=False)
+        ]
         upwards = [(p, up) for (_, p), up in zip(pairs, cycle((True, False)), strict=False)]
         less = sorted({share for _, share in spoilt if share < 1})
         title = f"Set points, on such models gone wrong: {'; or '.join(map(str, errors))}"

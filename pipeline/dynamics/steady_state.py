@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from loopwright.pipeline.metrics import Array
+Array = NDArray[np.float64]
 
 # ------------------------------------------------------------------------------------------------ bands and lengths
 # Simulators of any kind, whose states have units of their own. Used by: tests of own plants, local gains, bounds

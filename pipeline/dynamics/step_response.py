@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.pipeline.metrics import Array
+Array = NDArray[np.float64]
 
 # ------------------------------------------------------------------------------------------------ first answer
 # of the fastest change in a period, from which an output has answered, of step responses without noise; of its end, for

@@ -120,8 +120,11 @@ def test_a_set_point_is_held_three_times_as_long_as_the_model_needs(heater: OwnC
 
 def test_spoilt_plants_have_errors_and_carry_a_load(heater: OwnCase) -> None:
     tests = heater.scenarios()
-    high = 1 + LEAST_GAIN_ERROR
-    assert {float(t.changes["gain_TIC-101.OP"][0]) for t in tests["spoilt"]} == {high, 1 / high}
+    high = 1 + LEAST_GAIN_ERROR  # of one error alone; together with others it is less
+    gains = {float(t.changes["gain_TIC-101.OP"][0]) for t in tests["spoilt"]}
+    assert sorted(gains) == pytest.approx([high ** -(2**-0.5), high ** (3**-0.5)])
+    pairs = {(t.kind, id(t.plant)) for t in tests["spoilt"]}
+    assert len(pairs) == len(tests["spoilt"])  # no kind meets the same model twice
     for test in tests["load"]:
         assert test.plant is not None
         rest = simulate_closed(test.plant, lambda sp, pv, mv: (mv, []), test)
@@ -138,10 +141,11 @@ def test_errors_of_spoilt_plants_grow_with_what_the_record_leaves_open(heater: O
     assert isinstance(case, OwnCase)
     assert case.plant.parameters({"dead_time": 2.4}).tolist() == [1.0, 1.0, 2.4, 0.0]
     slow, fast, late = (dict(t.changes) for t in case.scenarios()["spoilt"])
-    assert [float(values[0]) for values in slow.values()] == pytest.approx([1.4, 1.6, 1.0])
-    assert [float(values[0]) for values in fast.values()] == pytest.approx([1 / 1.4, 1 / 1.6, 0.0])
+    three, two = 3**-0.5, 2**-0.5  # errors together are as likely as one alone
+    assert [float(values[0]) for values in slow.values()] == pytest.approx([1.4**three, 1.6**three, three])
+    assert [float(values[0]) for values in fast.values()] == pytest.approx([1.4**-two, 1.6**-two, 0.0])
     assert [float(values[0]) for values in late.values()] == pytest.approx([1.0, 1.0, 2.4])
-    assert "1 period later" in case.scenarios()["spoilt"][0].title
+    assert "0.58 periods later" in case.scenarios()["spoilt"][0].title
     assert "2.4 periods later" in case.scenarios()["spoilt"][0].title
     assert len(case.plant.variations()) == 1 + 3
 

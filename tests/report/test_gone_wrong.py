@@ -74,7 +74,7 @@ def test_kinds_in_the_title_and_in_the_rows_are_the_same_words() -> None:
     case = case_of(dead_sd=1.5)
     title = case.scenarios()["spoilt"][0].title
     rows = wrong_rows(evidence(case, *POOR_LATE))
-    assert [row.words for row in rows] == [str(wrong) for wrong in errors_of(case.plant)]  # type: ignore[arg-type]
+    assert [row.words for row in rows] == [str(wrong.as_likely) for wrong in errors_of(case.plant)]  # type: ignore[arg-type]
     assert all(row.words in title for row in rows)
     assert str(GoneWrong(LATE, {"gain_u0": 1.0, "time_constant": 1.0, "dead_time": 3.0})).endswith("3 periods later")
 

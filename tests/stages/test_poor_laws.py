@@ -87,7 +87,7 @@ def test_a_law_in_a_limit_cycle_on_a_model_as_it_is_is_not_shipped_and_its_loop_
 
 
 def test_a_limit_cycle_on_models_gone_wrong_alone_is_told() -> None:
-    controllers_of_a_lag({"pid": PI | {"kc": 0.9}})
+    controllers_of_a_lag({"pid": PI | {"kc": 1.4}})
     found = validated("pid")
     assert found.best == "pid"
     assert set(LawMetrics.read(Path("work/it/validation/pid/metrics.json")).cycles) == {"spoilt"}
