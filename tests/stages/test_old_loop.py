@@ -21,7 +21,7 @@ from loopwright.pipeline.stages.validate import validate
 from loopwright.pipeline.tracking.gate import Gate
 
 GOOD = {"law": "pid", "tuning": "manual", "kc": 0.2, "ti_s": 3.0}
-SLUGGISH, EAGER = GOOD | {"kc": 0.05}, GOOD | {"kc": 0.7}
+SLUGGISH, EAGER = GOOD | {"kc": 0.05}, GOOD | {"kc": 1.4}
 ARTIFACTS = Path("artifacts/it")
 
 
