@@ -163,20 +163,32 @@ def _export(
         export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
         row = {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
         row |= _analysed(law, plant, analysis_file(params.case, params.name, form, seed))
-        if withhold and form == BASE and (calm := law.calmed()) is not None:
-            export(
-                calm.eval(),
-                calm_file(params.case, params.name, seed),
-                case=params.case,
-                provenance=origin,
-                drive=_closed_loop(plant),
-            )
-            row |= {"calmed": _analysed(calm, plant, None)}
+        if withhold and form == BASE:
+            row |= _export_calmer(params, law, seed, plant, origin)
         return row
     except REFUSALS as error:
         if not withhold:
             raise  # who wrote equations and a law down wants to know
         raise WithheldError(_why(params.law, error)) from error
+
+
+def _export_calmer(
+    params: ControllerParams, law: ControlLaw, seed: int, plant: Simulator, origin: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The entry ``calmed`` of a file's row, of the law with calmer numbers beside it; {} where these cannot be made.
+
+    The law itself is made already, and is not withheld because its last resort cannot be.
+    """
+    path = calm_file(params.case, params.name, seed)
+    try:
+        calm = law.calmed()
+        if calm is None:
+            return {}
+        export(calm.eval(), path, case=params.case, provenance=origin, drive=_closed_loop(plant))
+        return {"calmed": _analysed(calm, plant, None)}
+    except REFUSALS:
+        path.unlink(missing_ok=True)
+        return {}
 
 
 def _analysed(law: ControlLaw, plant: Simulator, path: Path | None) -> dict[str, Any]:

@@ -11,9 +11,11 @@ import pytest
 from own_cases import controllers_of_a_lag
 from undrawn import draw_nothing
 
+from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.evaluation.law_evidence import LawMetrics
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.laws.pid import tuned
+from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.stages.design import design
 from loopwright.pipeline.stages.report import report
 from loopwright.pipeline.stages.validate import validate
@@ -83,3 +85,14 @@ def test_where_calmer_numbers_do_not_hold_the_reason_of_the_first_is_told(monkey
     assert "ends in a limit cycle" in why
     with np.load("work/it/validation/pid/trajectories.npz") as kept:
         assert any(name.startswith("cycling/") for name in kept.files)
+
+
+def test_a_last_resort_that_cannot_be_made_withholds_no_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(_: PID) -> PID:
+        raise LawError("no calmer numbers")
+
+    monkeypatch.setattr(PID, "calmed", refused)
+    found, own = run(monkeypatch, PidSettings(0.2, 3.0))
+    assert found.best == "pid"
+    assert own.calmed == ""
+    assert (ARTIFACTS / "pid.onnx").is_file()

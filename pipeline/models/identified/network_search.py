@@ -120,10 +120,10 @@ class NetworkSearch:
         offers = self.rounds.affordable(offers, QUICK_SEEDS[0] * (BEGINNING + SHORT_ITERATIONS), 0.4)
         cost = sum(self.rounds.budget.of(s, BEGINNING + SHORT_ITERATIONS) for s in offers)
         seeds = int(np.clip(self.rounds.budget.left(0.25) / cost, *QUICK_SEEDS))
-        tasks = [replace(self._task(s, 0, seed, SHORT_ITERATIONS), last=False) for s in offers for seed in range(seeds)]
+        tasks = [self._task(s, 0, seed, SHORT_ITERATIONS, last=False) for s in offers for seed in range(seeds)]
         quick = _ranked(self.rounds.trials(tasks, "neural networks, first training")[0])
         second = [
-            replace(self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE_ITERATIONS, t), last=False)
+            self._task(replace(t.structure, ridge=ridge), k, _seed(t), MIDDLE_ITERATIONS, t, last=False)
             for t in quick[:SECOND_CANDIDATES]
             for ridge in RIDGES
             for k in self._folds
@@ -164,14 +164,21 @@ class NetworkSearch:
         return range(len(self.rounds.problem.folds))
 
     def _task(
-        self, structure: Structure, fold: int, seed: int, iterations: int, trial: CandidateFits | None = None
+        self,
+        structure: Structure,
+        fold: int,
+        seed: int,
+        iterations: int,
+        trial: CandidateFits | None = None,
+        *,
+        last: bool = True,
     ) -> FitTask:
         """A fit, gone on from the one of ``trial`` where there is one."""
         uncorrected = replace(structure.base, correction=0.0)
         bases = (t for t in self.linear if replace(t.structure, correction=0.0) == uncorrected)
         base = next((t.fits[fold, 0] for t in bases if (fold, 0) in t.fits), None)
         begun = None if trial is None else trial.fits.get((fold, seed))
-        return FitTask(structure, fold, iterations, seed, base=base, begun=begun)
+        return FitTask(structure, fold, iterations, seed, base=base, begun=begun, last=last)
 
 
 def _ranked(trials: Sequence[CandidateFits]) -> list[CandidateFits]:
