@@ -12,7 +12,8 @@ try:
 except ModuleNotFoundError:  # on Windows, where nothing tells of a run
     fcntl = None  # type: ignore[assignment]
 
-MARK_FILE = Path("work") / ".run"
+# DVC's own scratch folder: git and DVC pass it over. A file in work/ would be one that no other clone has.
+MARK_FILE = Path(".dvc") / "tmp" / "loopwright-run"
 
 
 @contextlib.contextmanager

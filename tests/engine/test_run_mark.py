@@ -28,6 +28,7 @@ def test_before_and_after_a_run_nothing_is_under_way() -> None:
             pass
         assert runs_here()  # the other one still is
     assert not runs_here()
+    assert not Path("work").exists()  # there is only what stages make: a clone that pulls has the same files
 
 
 def test_a_run_that_is_killed_is_no_longer_under_way() -> None:
