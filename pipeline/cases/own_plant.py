@@ -195,7 +195,7 @@ class OwnCase(OwnEnsemble):
             sp, rests = self.reach.drawn(plant, seed, plant.parameters(of))
             test = replace(self._test("spoilt", "", sp, plant, seed, of), kind=wrong.kind)
             whole = whole or test
-            if rests and self.reach.stays(plant, plant.parameters(of)) and gets_there(plant, test):
+            if rests and self.reach.stays(plant, plant.parameters(of)) and gets_there(plant, test, self.asked):
                 return test, share
         assert whole is not None
         return whole, 1.0

@@ -25,7 +25,7 @@ HOLD_END_SAMPLES = 5  # samples at the end of a hold whose mean error is the ste
 SMALLEST_STEP = 0.02  # of the CV's range: a smaller move of the set point has no overshoot
 STEP_BAND = 0.02  # settled: within this fraction of the step ...
 RANGE_BAND = 0.002  # ... or of the CV's range, whichever is wider (a disturbance test has no step)
-UNREACHED_ERROR = 0.02  # of the CV's range: a larger error means that the loop has not reached its set point
+UNREACHED_ERROR = 0.02  # of what set points move a CV by: a larger error means that the loop has not reached one
 # of ``span``, the CV's range or its set points', changes of side: it swings to the end
 SWING_SIZE, SWING_CROSSINGS = 0.01, 3
 LEFT = 0.25  # of the CV's range: farther beyond its ends a loop has left it
@@ -114,8 +114,8 @@ def lock_ups(
     """The holds in which the loop locks up: it stays saturated and far from a set point.
 
     In the whole second half of such a hold one MV is at one end of [low, high], and |r - y| of one CV is more
-    than ``UNREACHED_ERROR`` of its ``span``, the CV's range. A slow plant or the heating of a batch may saturate for a
-    long time, but the error is smaller after half a hold (half a batch for a recipe). An inverse model
+    than ``UNREACHED_ERROR`` of its ``span``, by which set points move it. A slow plant or the heating of a batch may
+    saturate for a long time, but the error is smaller after half a hold (half a batch for a recipe). An inverse model
     outside its applicability domain can stay saturated for ever. Shapes (n,), or (n, n_cv) and (n, n_mv) with ranges
     (n_mv,) and spans (n_cv,).
     """

@@ -34,15 +34,14 @@ class Reached:
     mv: Array  # (n_mv,) the last ones
 
 
-def reached(plant: IdentifiedPlant, test: Scenario, part: slice, x: Array, mv: Array) -> Reached:
+def reached(plant: IdentifiedPlant, test: Scenario, part: slice, x: Array, mv: Array, span: Array) -> Reached:
     """The best course over a hold ``part`` of a test, from state x (n_x,) after MVs mv (n_mv,).
 
-    Near is ``UNREACHED_ERROR`` of a CV's range, as of a lock-up; parameters, loads and measured disturbances are the
-    test's.
+    Near is ``UNREACHED_ERROR`` of ``span`` (n_cv,), by which set points move each CV, as of a lock-up; parameters,
+    loads and measured disturbances are the test's.
     """
     sp, p, dv = test.sp[part], test.parameters(plant)[part], test.disturbances(plant)[part]
     n, n_cv = sp.shape
-    span = np.array([s.high - s.low for s in plant.sp_signals])
     low, high = (np.array([getattr(s, end) for s in plant.mv_signals]) for end in ("low", "high"))
     most = np.array([np.inf if s.max_move is None else s.max_move for s in plant.mv_signals])
     _, rest, away = balanced(plant, x, mv, sp[-1], range(n_cv), p[-1])
@@ -69,11 +68,14 @@ def reached(plant: IdentifiedPlant, test: Scenario, part: slice, x: Array, mv: A
     return Reached(bool(near.any()), states[best], moves[best])
 
 
-def gets_there(plant: IdentifiedPlant, test: Scenario) -> bool:
-    """Whether the best courses, hold after hold from the start of a test, come near all its set points."""
+def gets_there(plant: IdentifiedPlant, test: Scenario, span: Array) -> bool:
+    """Whether the best courses, hold after hold from the start of a test, come near all its set points.
+
+    ``span`` (n_cv,) is that of ``reached``.
+    """
     x, mv = test.x0, test.mv0
     for part in holds(test.samples, test.hold):
-        found = reached(plant, test, part, x, mv)
+        found = reached(plant, test, part, x, mv, span)
         if not found.near:
             return False
         x, mv = found.x, found.mv

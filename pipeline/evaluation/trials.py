@@ -184,13 +184,14 @@ def seized(case: Case, test: Scenario, loop: Trajectory) -> tuple[bool, int]:
     """
     n = test.sp.shape[1]
     # As many MVs as set points; a further one may have a part that rests at an end.
-    mvs, spans = case.plant.mv_signals[:n], [s.high - s.low for s in case.plant.sp_signals]
+    mvs = case.plant.mv_signals[:n]
     limits = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
-    jammed = lock_ups(loop.sp, loop.pv[:, :n], loop.mv[:, :n], test.hold, **limits, span=spans)
+    jammed = lock_ups(loop.sp, loop.pv[:, :n], loop.mv[:, :n], test.hold, **limits, span=case.asked)
     plant, beyond = test.plant or case.plant, list[slice]()
     if case.on_models and isinstance(plant, IdentifiedPlant):
         before = np.vstack([test.mv0, loop.mv])  # the MVs at the beginning of each sample
-        beyond = [of for of in jammed if not reached(plant, test, of, loop.x[of.start], before[of.start]).near]
+        best = (reached(plant, test, of, loop.x[of.start], before[of.start], case.asked) for of in jammed)
+        beyond = [of for of, found in zip(jammed, best, strict=True) if not found.near]
     ends = {end: [getattr(s, end) for s in case.plant.sp_signals] for end in ("low", "high")}
     left = case.on_models and left_limits(loop.pv[:, :n], test.hold, **ends)
     return len(jammed) > len(beyond) or left or bool(loop.info[:, -1].any()), len(beyond)

@@ -52,7 +52,7 @@ def a_test(case: OwnCase, levels: list[float], **changed: float) -> Scenario:
 def near(case: OwnCase, level: float, **changed: float) -> bool:
     test = a_test(case, [level], **changed)
     assert isinstance(test.plant, IdentifiedPlant)
-    return reached(test.plant, test, slice(0, HOLD), test.x0, test.mv0).near
+    return reached(test.plant, test, slice(0, HOLD), test.x0, test.mv0, case.asked).near
 
 
 def test_what_can_be_reached_and_what_cannot() -> None:
@@ -72,7 +72,7 @@ def test_an_mv_that_may_move_slowly_only_gets_less_far() -> None:
     test = a_test(case, [1.9])
     assert isinstance(test.plant, IdentifiedPlant)
     vars(test.plant)["mv_signals"] = (replace(mv, max_move=0.001),)
-    assert not reached(test.plant, test, slice(0, HOLD), test.x0, test.mv0).near
+    assert not reached(test.plant, test, slice(0, HOLD), test.x0, test.mv0, case.asked).near
 
 
 @pytest.mark.parametrize("make", [two_lags, filled_level])
@@ -80,8 +80,18 @@ def test_every_set_point_of_ordinary_tests_is_reached(make: Any) -> None:
     case = make()
     for name in ("held_out", "spoilt"):
         for test in case.scenarios()[name]:
-            assert gets_there(test.plant, test)
+            assert gets_there(test.plant, test, case.asked)
             assert test.title.count("; ") == int(name == "spoilt")  # all of the errors
+
+
+def test_a_lock_up_is_told_by_what_set_points_move_not_by_the_range() -> None:
+    """Set points go 1.74 from one to another, the range is 6 wide: at an end, .06 short of a set point."""
+    case = controllers_of_a_lag({})
+    test = a_test(case, [1.94])
+    assert 0.02 * case.asked[0] < 0.06 < 0.02 * 6
+    assert seized(case, test, close_loop(AtEnd(1.0), case.plant, test, None, 0)) == (True, 0)  # type: ignore[arg-type]
+    assert not near(case, 2.06)
+    assert near(case, 2.02)
 
 
 def test_a_hold_beyond_reach_is_no_lock_up_and_is_counted() -> None:
@@ -112,10 +122,10 @@ def test_errors_that_no_control_copes_with_are_lessened_and_the_title_says_so(
     case, whole = controllers_of_a_lag({}), controllers_of_a_lag({}).scenarios()["spoilt"]
     slowest = max(float(t.changes["time_constant"][0]) for t in whole)
 
-    def able(plant: Any, test: Scenario) -> bool:
+    def able(plant: Any, test: Scenario, span: Any) -> bool:
         """A quarter of the errors, of plants that are slower."""
         tau = float(test.changes["time_constant"][0])
-        return tau < 1 + 0.4 * (slowest - 1) or not gets_there(plant, test)
+        return tau < 1 + 0.4 * (slowest - 1) or not gets_there(plant, test, span)
 
     monkeypatch.setattr(own_plant, "gets_there", able)
     found = case.scenarios()["spoilt"]

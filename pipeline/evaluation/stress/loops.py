@@ -198,7 +198,7 @@ class Stress:
         return StressOutcome(
             draw.index,
             dict.fromkeys(figures, float("inf")) if broke else figures,
-            locked_up(loop.sp, loop.pv[:, :n_cv], loop.mv[:, :n_cv], test.hold, **limits, span=spans),
+            locked_up(loop.sp, loop.pv[:, :n_cv], loop.mv[:, :n_cv], test.hold, **limits, span=case.asked),
             left_limits(loop.pv[:, :n_cv], test.hold, **ends),
             int(loop.info.sum()),
             broke,
