@@ -78,7 +78,7 @@ def fit_doubts(models: Mapping[str, Metrics]) -> str:
 
 
 def _predictions(proof: Mapping[str, Any]) -> dict[str, CheckedStatement]:
-    """PV -> the row of its free run, or of a closed loop's record of its one-step predictions."""
+    """PV -> the row of its free run, or, where loads wander or a controller acts, of its one-step predictions."""
     found = {}
     for name, of in (proof.get("one_step") or {}).items():
         found[name] = CheckedStatement(
@@ -108,7 +108,7 @@ def _signs(proof: Mapping[str, Any]) -> Iterator[tuple[CheckedStatement, str]]:
 
 
 def _foreseen(proof: Mapping[str, Any], pv: str) -> bool:
-    """Whether the inputs foresee a PV of a closed loop one row ahead."""
+    """Whether the inputs foresee a PV one row ahead, where free runs do not judge."""
     one_step = proof.get("one_step") or {}
     return pv in one_step and one_step[pv]["nats"] >= FORESEEN
 

@@ -87,7 +87,8 @@ class IdentifiedPart(Part):
     inputs move most, and three times as many where the MVs follow the outputs.
 
     Where the MVs follow the outputs, and no ``correction`` is given, models with their noise are fitted and judged by
-    one-step errors in place of free runs.
+    one-step errors in place of free runs; else beside them, where the free runs miss more than noise, and errors some
+    rows ahead decide.
     """
 
     model: ClassVar[type[Model]] = Identified
@@ -223,7 +224,7 @@ def _proof(
     figures = proof_figures(found[0], record, scales, [runs, *second], np.minimum(noise, found[1] * scales.y_scale))
     if searched.selection.innovations is None:
         return figures
-    # A free run of a closed loop holds the loads that the controller fought, and says nothing of the model.
+    # A free run holds the loads that nobody measured, and says nothing of the model.
     return {"answers": figures["answers"], "one_step": foreseen(problem, chosen, list(runs), scales.y_scale)}
 
 

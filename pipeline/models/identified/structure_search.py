@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.historian.answers import Beside, beside_record
 from loopwright.pipeline.historian.feedback import fed_back
 from loopwright.pipeline.models.identified.candidates import RESTING_SHARE, misses, rests_under
@@ -25,6 +26,7 @@ from loopwright.pipeline.models.identified.scaled_record import (
 )
 from loopwright.pipeline.models.identified.steady_states import INTEGRATES, slowest_pole
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, CandidateFits, Problem, best_of
+from loopwright.pipeline.models.identified.wandering_load import foresees_better
 from loopwright.pipeline.models.part import Groundwork, Source
 
 SETTLING_POLE = 0.98
@@ -43,7 +45,7 @@ TRIED_CORRECTION = 0.05
 """Correction of training runs that is tried where the linear model integrates, or the best network misses much."""
 
 DRIFTS = 1.5
-"""Residual over noise of the best network above which the correction is tried."""
+"""Residual over noise above which the correction is tried on the best network, and models with loads beside all."""
 
 LEAST_NETWORK_GAIN = 0.01
 """Least relative gain of a network over the linear model, beside its spread."""
@@ -65,6 +67,7 @@ class Selection:
     innovations: float | None = None  # nats by which one-step errors prefer the network; None: free runs judged
     farthest: float = FARTHEST  # scaled: where rests of a network may lie
     dead_times: Sequence[tuple[int, int]] = ()  # [periods] least and most of each input that explain the rows alike
+    wanders: bool = False  # whether one-step errors judged for loads that wander, not for a controller that acts
     refused: bool = False  # whether the record does not prove the network's gains: the linear model takes its place
 
     @property
@@ -104,6 +107,28 @@ def select(
 ) -> Selection:
     """The search over one record.
 
+    Where the MVs follow the outputs, ``by_innovations``. Else ``by_free_runs``; where the residual of its choice
+    exceeds ``DRIFTS`` times the noise, both, and the model that foresees held-out rows better some rows ahead. With a
+    ``correction`` that is given, free runs decide. Raises ModelError where no candidate can be fitted.
+    """
+    if correction is not None:
+        return by_free_runs(rounds, orders, units, correction, lagged=lagged)
+    if rounds.problem.fed_back:
+        return by_innovations(rounds, orders, units)
+    found = by_free_runs(rounds, orders, units, lagged=lagged)
+    return _beside_loads(rounds, found, orders, units) if _misses(rounds.problem, found.chosen, DRIFTS) else found
+
+
+def by_free_runs(
+    rounds: Rounds,
+    orders: Sequence[int],
+    units: Sequence[int],
+    correction: float | None = None,
+    *,
+    lagged: bool = True,
+) -> Selection:
+    """The search among models judged by free runs over held-out rows: for records in which no load wanders.
+
     Linear candidates first: balanced starts of each order with and without the dead times that the impulse
     response shows, and lagged starts unless ``lagged`` is false; where the record leaves it open, with the MVs acting
     in their own row too. Then networks on the best of them, unless its residual is white and follows no curve of its
@@ -113,8 +138,6 @@ def select(
     where the plant drifts inside the record, beyond a gain and a level of each part. Raises ModelError where no
     candidate can be fitted.
     """
-    if rounds.problem.fed_back and correction is None:
-        return by_innovations(rounds, orders, units)
     given = 0.0 if correction is None else correction
     search = LinearSearch.of(rounds)
     linear = search.finish(search.first_round(orders, given, lagged))
@@ -151,10 +174,24 @@ def select(
     return Selection(linear[0], best_of(finalists), every, spent, problem.settles, drifting, None, problem.farthest)
 
 
-def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) -> Selection:
-    """The search among models with their noise, judged by one-step errors over held-out rows: for closed loops.
+def _beside_loads(rounds: Rounds, found: Selection, orders: Sequence[int], units: Sequence[int]) -> Selection:
+    """The outcome of ``by_innovations`` where it foresees the rows better than what free runs found, else that one."""
+    again = replace(rounds, budget=replace(rounds.budget, spent=0.0))
+    try:
+        other = by_innovations(again, orders, units)
+    except ModelError:  # no filter follows the record
+        return found
+    spent = found.spent + other.spent
+    if not foresees_better(rounds, other.chosen, found.chosen):
+        return replace(found, spent=spent)
+    return replace(other, spent=spent, wanders=True)
 
-    Free runs would rank them by how they read the controller backwards, and by the loads that nobody measures.
+
+def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) -> Selection:
+    """The search among models with their noise, judged by one-step errors over held-out rows: where loads wander.
+
+    Free runs would rank them by the loads that nobody measures, and in a closed loop by how they read the controller
+    backwards.
     """
     search = NoiseSearch.of(rounds)
     ranked = search.linear(orders)

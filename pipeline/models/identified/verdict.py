@@ -59,8 +59,9 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
     elif selection.refused:
         words = "linear: a network was chosen first, but the record does not prove its gains, and proves these"
     elif selection.innovations is not None and not selection.nonlinear:
+        where = "in which loads wander" if selection.wanders else "in closed loop"
         words = (
-            "linear: one row ahead no network is better by enough to count; a record in closed loop often does not "
+            f"linear: one row ahead no network is better by enough to count; a record {where} often does not "
             "tell whether gains change over the range"
         )
     elif selection.nonlinear:
@@ -97,7 +98,8 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
 
 def _judged(selection: Selection) -> str:
     if selection.innovations is not None:
-        return "one-step errors with a model of the loads, for the MVs follow the PVs"
+        why = "loads wander in the record" if selection.wanders else "the MVs follow the PVs"
+        return f"one-step errors with a model of the loads ({why})"
     return "free run" + (" beyond a gain and a level of each part of the record" if selection.drifts else "")
 
 
@@ -107,7 +109,7 @@ def free_run_figures(
     """(figures of each PV, {measured, free run} (n, n_y)) of a fold's best fit over the rows that it never saw.
 
     Runs of a model with its noise begin anew from its filter every ``PREDICTED_AHEAD`` rows: a run over all of them
-    would hold the loads that the controller fought, and say nothing of the model. ``free_run_rmse`` and the PV's own
+    would hold the loads that nobody measured, and say nothing of the model. ``free_run_rmse`` and the PV's own
     deviation ``held_sd`` in its unit, ``fit_percent``, ``rmse_by_third``: where the PV was low, in the middle and high,
     and ``outside_training``: the share of these rows in which it left the range of the training rows, where the error
     says nothing of the other rows.

@@ -80,8 +80,10 @@ def test_noise_of_a_measured_disturbance_is_found() -> None:
 def test_noise_of_a_measured_disturbance_makes_no_gain_too_small() -> None:
     record, signals = made_plants.two_by_two(2000, measured=True), made_plants.signals_of(2, 2, 1)
     noisy = replace(record, dv=record.dv + np.random.default_rng(2).normal(size=record.dv.shape))
-    gains = LINEAR.learn(Source(noisy, signals)).metrics["gains"]
-    assert [gains[y]["d0"]["gain"] for y in ("y0", "y1")] == pytest.approx([2.0, -1.0], rel=0.015)
+    # What the smoothed readings miss wanders, so that by itself the search takes a model with loads.
+    for correction, error in ((0.0, 0.015), (None, 0.03)):
+        gains = replace(LINEAR, correction=correction).learn(Source(noisy, signals)).metrics["gains"]
+        assert [gains[y]["d0"]["gain"] for y in ("y0", "y1")] == pytest.approx([2.0, -1.0], rel=error)
 
 
 def test_a_second_process_variable_is_an_output_where_all_measured_ones_are() -> None:

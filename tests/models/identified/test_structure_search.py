@@ -99,7 +99,7 @@ def test_a_linear_model_that_settles_goes_on_to_settle_over_all_rows() -> None:
     record = made_plants.second_order(600)
     risen = record.pv + 20 * np.maximum(np.arange(600) - 400, 0)[:, None] / 200
     source = Source(replace(record, pv=risen), made_plants.signals_of(1, 1))
-    searched = replace(PART, units=()).groundwork().done(source, "search")
+    searched = replace(PART, units=(), correction=0.0).groundwork().done(source, "search")
     trial, problem = searched.selection.linear, searched.problem
     assert problem.settles
     for fold in trial.folds:
