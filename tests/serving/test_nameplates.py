@@ -222,12 +222,13 @@ def test_an_mv_whose_written_node_is_another_one_is_not_written_and_its_sample_i
         assert made.fault == valued(made, plan).fault == ""
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
     endpoint = OpcUaEndpoint(manifest, server, made.nodes, max_age_s=1.0)
-    endpoint.nameplates, endpoint._link, endpoint._told_on, endpoint._shown_on = made, link, 1, 1  # type: ignore[assignment]
+    endpoint.nameplates, endpoint._link = made, link  # type: ignore[assignment]
+    endpoint.sender.told_on = endpoint.sender.shown_on = 1
     with pytest.raises(EndpointError, match="MV valve, written: "):
         endpoint.write(np.array([50.0]))
-    endpoint._outbox.append(np.array([50.0]))  # passed on before it was known
-    asyncio.run(endpoint._send(link, plan))  # type: ignore[arg-type]
-    assert endpoint.unwritten == made.unwritable
+    endpoint.sender.outbox.append(np.array([50.0]))  # passed on before it was known
+    asyncio.run(endpoint.sender.send(link, plan, made))  # type: ignore[arg-type]
+    assert endpoint.sender.unwritten == made.unwritable
     link.kinds, link.units, link.ends = {}, {}, {}
     asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
     assert made.unwritable == ""

@@ -72,22 +72,22 @@ def test_the_second_loop_holds_until_the_first_is_gone(
 ) -> None:
     """Neither is told of a lease: both find the plant's own."""
     first = machine(tmp_path / "a", plant, "AUTO", monkeypatch, nodes="")
-    assert within(20, lambda: first.station.endpoint.lease.held and mode(first)[0] is Mode.AUTO)
+    assert within(20, lambda: first.station.endpoint.sender.lease.held and mode(first)[0] is Mode.AUTO)
     second = machine(tmp_path / "b", plant, "SHADOW", monkeypatch, nodes="")
     try:
         # A shadow beside it needs no lease and takes none.
         assert within(10, lambda: second.station.scans > 10)
-        owner = first.station.endpoint.lease.owner
+        owner = first.station.endpoint.sender.lease.owner
         assert within(20, lambda: lease(plant).startswith(owner))  # one that lost the plant for a moment takes it anew
         second.does("mode", "AUTO")
         refused = f"the plant is controlled by {owner}"
         assert within(20, lambda: any(refused in c.reason and c.mode is Mode.HOLD for c in second.commands))
         before = len(plant.actuator())
         assert within(20, lambda: len(plant.actuator()) > before + 10)
-        assert not second.station.endpoint.lease.held
+        assert not second.station.endpoint.sender.lease.held
         assert within(20, lambda: mode(first)[0] is Mode.AUTO)  # a busy machine may hold it for a moment
         first.end()
-        assert within(30, lambda: second.station.endpoint.lease.held and mode(second)[0] is Mode.AUTO)
+        assert within(30, lambda: second.station.endpoint.sender.lease.held and mode(second)[0] is Mode.AUTO)
         second.does("mode", "SHADOW")
         assert within(20, lambda: lease(plant) == "")
     finally:
@@ -141,7 +141,7 @@ def test_a_lease_of_a_loop_that_was_killed_is_taken_over(
     lease(plant, "elsewhere:17:abc 41")
     loop = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
     try:
-        assert within(30, lambda: loop.station.endpoint.lease.held and mode(loop)[0] is Mode.AUTO)
+        assert within(30, lambda: loop.station.endpoint.sender.lease.held and mode(loop)[0] is Mode.AUTO)
         # Somebody else takes it: the next reading finds that out, and nothing is written any more.
         lease(plant, "elsewhere:18:def 1")
         refused = "the plant is controlled by elsewhere:18:def"
