@@ -28,7 +28,7 @@ HAND_BACK = "hand back"
 
 
 class MvSender:
-    """What waits to be written, why the last of it did not arrive, and the lease under which it is written.
+    """The MVs that wait to be written, why the last one did not arrive, and the lease under which they are written.
 
     The loop calls ``called``, ``stands``, ``refuse`` and ``ask_back``, the connection's thread all others.
 
