@@ -246,7 +246,7 @@ class AdaptivePid(ControlLaw):
         The law's own slots; its info names after those of the gains.
     """
 
-    incremental = True
+    velocity_form = True
     looks_ahead = 1
     model: Any
 

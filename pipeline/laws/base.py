@@ -101,7 +101,7 @@ class ControlLaw(nn.Module, ABC):
     Params: ClassVar[type[Any]]  # frozen dataclass: the law's parameters in params.yaml, with `mv_rate`
     # True if the law adds a move to the applied MV: its transfer from manual is bumpless, and a start at the set
     # point does not move the actuator. Other laws compute the MV without the applied one.
-    incremental: ClassVar[bool] = False
+    velocity_form: ClassVar[bool] = False
     # True if the law starts from an estimate of the plant's state, which the applied MV is a part of.
     estimates: ClassVar[bool] = False
     one_loop: ClassVar[bool] = True  # whether it controls one variable by one

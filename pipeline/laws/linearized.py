@@ -281,7 +281,7 @@ class MinimumVariance(ControlLaw):
     name: ClassVar[str] = "minimum_variance"
     title: ClassVar[str] = "Minimum variance by the NNARX, no PID"
     parts: ClassVar[Mapping[str, str]] = {"nnarx": "kind nnarx"}
-    incremental: ClassVar[bool] = True
+    velocity_form: ClassVar[bool] = True
     looks_ahead: ClassVar[int | None] = 1
 
     @dataclass(frozen=True, slots=True)

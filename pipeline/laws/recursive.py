@@ -148,7 +148,7 @@ class SelfTuningPid(ControlLaw):
     name: ClassVar[str] = "self_tuning_pid"
     title: ClassVar[str] = "Self-tuning PID"
     parts: ClassVar[Mapping[str, str]] = {"arx": "kind arx"}
-    incremental: ClassVar[bool] = True
+    velocity_form: ClassVar[bool] = True
     looks_ahead: ClassVar[int | None] = 1
 
     @dataclass(frozen=True, slots=True, kw_only=True)

@@ -292,18 +292,18 @@ class _Lines:
 
     def show(self, sample: Sample | None, command: Command) -> None:
         """Tell the scan if it is one of those."""
-        now = (command.mode.value, tuple(command.sp.tolist()), command.reason)
+        now = (command.mode.value, tuple(command.sp.tolist()), command.fault)
         if now == self.last and command.scan % self.every:
             return
         self.last, m = now, self.manifest
-        self.known = self.known or not command.reason
+        self.known = self.known or not command.fault
         parts = [f"SP {s.name} {v:.5g}" for s, v in zip(m.sp, command.sp.tolist(), strict=True) if self.known]
         if sample is not None:
             parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in _known(m.pv, sample.pv)]
         parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in _known(m.mv, command.mv)]
         if not command.writes and command.law_mv is not None:
             parts += [f"(law {s.name} {v:.5g})" for s, v in zip(m.mv, command.law_mv.tolist(), strict=True)]
-        self.tell(f"{command.mode:<6}  {'  '.join(parts)}  {command.reason}".rstrip())
+        self.tell(f"{command.mode:<6}  {'  '.join(parts)}  {command.fault}".rstrip())
 
 
 def _known(signals: Sequence[Signal], values: NDArray[np.float64]) -> list[tuple[Signal, float]]:

@@ -24,7 +24,7 @@ from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import ModeNode, Nodes, Point, Server
 from loopwright.serving.opcua.values import BusyError, LateError, NodeReading
 from loopwright.serving.station.build_loop import keep_namespaces, keep_nodes, namespaces_before, nodes_before
-from loopwright.serving.station.requests import Wishes
+from loopwright.serving.station.requests import NodeRequests
 
 pytest_plugins = ["small_laws"]
 UA_SPACE = "http://opcfoundation.org/UA/"
@@ -192,8 +192,8 @@ def test_a_node_of_another_type_is_a_fault_while_it_is(name: str, manifest: Mani
     assert valued(made, plan).fault == ""
     other = valued(made, plan, **{name.replace(" ", "_"): INT32})
     assert other.fault.startswith(f"{name}: its type is Int32 now and was Double") is used
-    wishes = Wishes()
-    assert [len(wishes.refused(v)) for v in (other, other, valued(made, plan), other)] == [wish, 0, 0, wish]
+    asked = NodeRequests()
+    assert [len(asked.refused(v)) for v in (other, other, valued(made, plan), other)] == [wish, 0, 0, wish]
     assert (other.asked_mode, bool(other.asked_sp)) == ("" if name == "mode" else "AUTO", name != "SP level")
     assert np.isnan(other.mv[0]) == (name == "MV valve")
     assert valued(made, plan).fault == ""

@@ -74,7 +74,7 @@ def loop(controller: Controller, plant: Plant) -> ControlLoop:
 def scan(loop: ControlLoop, plant: Plant) -> str:
     """One scan whose MV goes out at once; its reason."""
     reasons: list[str] = []
-    loop.run(1, observe=lambda _, command: reasons.append(command.reason))
+    loop.run(1, observe=lambda _, command: reasons.append(command.fault))
     plant.sends()
     return reasons[0]
 

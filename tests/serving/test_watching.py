@@ -26,7 +26,7 @@ def scan_of(controller: Controller, k: int, time_s: float) -> tuple[None, Comman
     """One scan of a loop that holds."""
     m = controller.manifest
     mv, sp = np.array([s.middle for s in m.mv]), np.array([s.middle for s in m.sp])
-    return None, Command(k, Mode.HOLD, sp, mv, None, None, reason="lost"), time_s
+    return None, Command(k, Mode.HOLD, sp, mv, None, None, fault="lost"), time_s
 
 
 @pytest.fixture

@@ -159,7 +159,7 @@ def _written(root: Element) -> bytes:
 
 # ----------------------------------------------------------------------------------------------- the content of an FMU
 MADE = (1980, 1, 1, 0, 0, 0)  # the time of every entry: the same controller gives the same bytes
-QUICK = 1  # compression: onnxruntime's library is nearly all of the file, and 9 saves a tenth of it
+ZIP_LEVEL = 1  # compression: onnxruntime's library is nearly all of the file, and 9 saves a tenth of it
 LICENCES = ("LICENSE", "ThirdPartyNotices.txt")
 
 
@@ -206,7 +206,7 @@ def pack(folder: Path, to: Path) -> None:
                 entry = zipfile.ZipInfo(path.relative_to(folder).as_posix(), MADE)
                 entry.compress_type = zipfile.ZIP_DEFLATED
                 entry.external_attr = (0o755 if path.name.startswith("lib") or path.suffix == ".so" else 0o644) << 16
-                made.writestr(entry, path.read_bytes(), compresslevel=QUICK)
+                made.writestr(entry, path.read_bytes(), compresslevel=ZIP_LEVEL)
 
 
 def _write_controller(controller: Controller, resources: Path) -> None:

@@ -228,7 +228,7 @@ class LocalControllers(ControlLaw):
     gains around one integrator is not in the paper.
     """
 
-    incremental = True
+    velocity_form = True
     parts: ClassVar[Mapping[str, str]] = {"local_models": "kind local_models"}
 
     table: Tensor  # (m, 5): Kp_i, h Ki_i, Kd_i/h, a_i, u_i

@@ -55,7 +55,7 @@ class PID(ControlLaw):
 
     name: ClassVar[str] = "pid"
     title: ClassVar[str] = "PID"
-    incremental: ClassVar[bool] = True
+    velocity_form: ClassVar[bool] = True
     one_loop: ClassVar[bool] = False
 
     @dataclass(frozen=True, slots=True)
