@@ -45,7 +45,7 @@ from untouched import UNTOUCHED
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.laws.base import ControlLaw
-from loopwright.pipeline.plants.perturbed import SpoiltPlant
+from loopwright.pipeline.plants.simulator import SpoiltPlant
 
 ROWS, CLOSED_ROWS = 8_000, 12_000
 GROUPS = {

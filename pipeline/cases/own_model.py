@@ -14,8 +14,7 @@ from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant, longest_memory
 from loopwright.pipeline.plants.noise import deviation
-from loopwright.pipeline.plants.perturbed import SpoiltPlant, likely_error
-from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
+from loopwright.pipeline.plants.simulator import Array, Signals, Simulator, SpoiltPlant, likely_error
 from loopwright.pipeline.simulation.scenario import Scenario
 
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.

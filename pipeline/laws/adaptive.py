@@ -11,9 +11,8 @@ from scipy.special import chdtri
 from torch import Tensor, nn
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.base import ControlLaw, hold_numbers, require_single_loop
+from loopwright.pipeline.laws.base import ControlLaw, OfRange, ascend, hold_numbers, in_units, require_single_loop
 from loopwright.pipeline.laws.gain_update import PidForm, gain_update
-from loopwright.pipeline.laws.scaled_defaults import OfRange, ascend, in_units
 from loopwright.pipeline.models.memory import Memory, Named, Slot
 from loopwright.pipeline.plants.simulator import Signals
 

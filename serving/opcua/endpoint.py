@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from loopwright.serving.errors import EndpointError, LoopError
 from loopwright.serving.guard import Sample
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.opcua.heartbeat import Heartbeat
 from loopwright.serving.opcua.link import Link
-from loopwright.serving.opcua.mv_sender import HAND_BACK, MvSender
+from loopwright.serving.opcua.mv_sender import HAND_BACK, Heartbeat, MvSender
 from loopwright.serving.opcua.nameplates import Identity, Nameplates, identity, whole
 from loopwright.serving.opcua.node_lease import NodeLease
 from loopwright.serving.opcua.plan import NodePlan

@@ -18,8 +18,7 @@ from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified import remembering
-from loopwright.pipeline.plants.perturbed import SpoiltPlant
-from loopwright.pipeline.plants.simulator import Signals
+from loopwright.pipeline.plants.simulator import Signals, SpoiltPlant
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.simulate import noise_draws, simulate_closed
 from loopwright.pipeline.tuning.responses import StepResponses

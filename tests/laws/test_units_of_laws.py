@@ -15,10 +15,10 @@ from quick_laws import CALM, FORMS, QUICK_PARAMS, plant_of, quick_parts, rest_po
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.laws import LAWS, ControlLaw
-from loopwright.pipeline.laws.scaled_defaults import OfRange
+from loopwright.pipeline.laws.base import OfRange
 from loopwright.pipeline.models import Model
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.models.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.local_models import LocalModels
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.scenario import Scenario
