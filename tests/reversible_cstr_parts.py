@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopwright.pipeline.laws.reference.reference_loops import Training
+from loopwright.pipeline.laws.reference.reference_law import Training
 from loopwright.pipeline.models import Model
 from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.models.training.fit import LevenbergMarquardt

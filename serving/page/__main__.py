@@ -16,7 +16,7 @@ import uvicorn
 from loopwright.serving.errors import LoopError
 from loopwright.serving.page.access import Impatient
 from loopwright.serving.page.app import PageApp
-from loopwright.serving.page.settings import Page, listening
+from loopwright.serving.page.process import Page, listening
 from loopwright.serving.station.control import asked
 from loopwright.serving.words import first_line, named
 

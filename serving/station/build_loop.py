@@ -25,7 +25,7 @@ from loopwright.serving.loop import WARM_LEAD_S, ControlLoop, Mode
 from loopwright.serving.manifest import Signal
 from loopwright.serving.opcua.nameplates import Identity, Seen
 from loopwright.serving.opcua.sampling import Values
-from loopwright.serving.page.settings import listening, require_usable
+from loopwright.serving.page.process import listening, require_usable
 from loopwright.serving.station.mv_lock import Lease, address_of
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.trust import require_accepted

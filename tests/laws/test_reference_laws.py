@@ -17,7 +17,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
 from loopwright.pipeline.laws.reference.pi_reference import PiReference
-from loopwright.pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
+from loopwright.pipeline.laws.reference.reference_law import Loops, PlantNetwork, Training
 from loopwright.pipeline.laws.reference.reference_networks import (
     IncrementalNetwork,
     Trainable,

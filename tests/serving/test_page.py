@@ -22,8 +22,7 @@ from processes import lives, within
 from loopwright.serving import Controller, LoopError
 from loopwright.serving.journal import EventEntry, Journal, JournalReader, ScanEntry
 from loopwright.serving.page.live import Live
-from loopwright.serving.page.process import PageProcess
-from loopwright.serving.page.settings import Page
+from loopwright.serving.page.process import Page, PageProcess
 from loopwright.serving.page.trend import Modes, Thinned, trend
 
 pytest_plugins = ["small_laws"]
@@ -235,7 +234,7 @@ OWNER = """
 import sys
 from pathlib import Path
 from loopwright.serving.page.process import PageProcess
-from loopwright.serving.page.settings import Page
+from loopwright.serving.page.process import Page
 page = PageProcess(Page("127.0.0.1:0"), Path(sys.argv[1]), Path(sys.argv[2]), print)
 print(page._process.pid, flush=True)
 sys.stdin.read()

@@ -21,8 +21,7 @@ from loopwright.pipeline.laws.predictive.params import (
     refuse_discrete,
     weights_of,
 )
-from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
-from loopwright.pipeline.laws.predictive.set_points import PRICE, SetPointCourse, SoftLimits
+from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Cost, Planner, SetPointCourse, SoftLimits
 from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, calmest, in_words, tuned
 from loopwright.pipeline.laws.predictive.tuning_loops import TuningLoops
 from loopwright.pipeline.models.base import Model
