@@ -184,7 +184,7 @@ def likely_error(sd: Array, least: float, most: float) -> Array:
     return np.clip(LEFT_OPEN_SDS * sd, least, most)
 
 
-class SpoiltPlant(Simulator):
+class PerturbedPlant(Simulator):
     """A plant whose parameters are others from the start on, such as a gain of 1.25; its equations are not seen."""
 
     def __init__(self, plant: Simulator, changed: Mapping[str, float]) -> None:

@@ -70,7 +70,7 @@ def unit_of(s: Signal) -> str:
 
 
 # ------------------------------------------------------------------------------------------ the meaning of the figures
-MOST_HOLD = 0.02
+MOST_HOLD = 0.02  # share of the time in HOLD: above it somebody should look
 TOLD_AT_LIMITS, TOLD_OUTSIDE = 0.2, 0.1  # of the time: at limits, and outside the domain, from which on it is told
 SWING_REGULARITY = 1.0  # regularity of the error's crossings above which it is a swing, if large enough too
 WORSE_ERROR = 2.0  # times the validation's worst mean error: how often set points move is another matter here

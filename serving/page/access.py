@@ -84,7 +84,7 @@ STALLED_S = 30.0  # in which an answer that is waiting must be taken
 MOST_CONNECTIONS = 200  # connections at once, not browsers: beyond it the longest idle one is closed
 
 
-class Impatient(H11Protocol):
+class TimedConnection(H11Protocol):
     """Closes a connection that is open for ``REQUEST_S`` without a whole request, or takes no answer for ``STALLED_S``.
 
     Beyond the most connections the one that has idled longest goes, else the one that is open longest, whatever is
@@ -155,9 +155,9 @@ class Impatient(H11Protocol):
             self._stalled.cancel()
             self._stalled = None
 
-    def _to_go(self) -> Impatient:
+    def _to_go(self) -> TimedConnection:
         """The idle connection whose deadline comes first; the one that is open longest where all are busy."""
-        others = [c for c in self.connections if isinstance(c, Impatient) and not c.transport.is_closing()]
+        others = [c for c in self.connections if isinstance(c, TimedConnection) and not c.transport.is_closing()]
         idle = [(c._deadline.when(), i) for i, c in enumerate(others) if c._deadline is not None]
         busy = [(c._began, i) for i, c in enumerate(others) if c is not self]
         return others[min(idle or busy)[1]] if idle or busy else self

@@ -179,7 +179,7 @@ def _check(options: argparse.Namespace) -> int:
     controller = tried(settings.controller, settings.sha256 or None, settings.trusted)
     manifest = controller.manifest
     from loopwright.serving.opcua.inspection import Found, inspected
-    from loopwright.serving.opcua.nameplates import Seen, others_since
+    from loopwright.serving.opcua.nameplates import KnownNode, others_since
     from loopwright.serving.station.build_loop import namespaces_before, nodes_before, rehearsed, require_free
 
     here = rehearsed(settings, controller)
@@ -201,7 +201,7 @@ def _check(options: argparse.Namespace) -> int:
     wrong = [*here.wrong[said:], *(f"{row.signal}: {row.wrong}" for row in rows if row.wrong)]
     notes = [f"{row.signal}: {row.note}" for row in rows if row.note]
     notes += others_since(
-        nodes_before(settings.journal.file), {r.signal: Seen(r.node, r.kind, r.unit, r.limits) for r in rows}
+        nodes_before(settings.journal.file), {r.signal: KnownNode(r.node, r.kind, r.unit, r.limits) for r in rows}
     )
     for note in [*notes, *here.notes, *_unproven(manifest), *_warnings(settings), *ending(controller)]:
         print(plain(f"note: {note}"))

@@ -136,7 +136,7 @@ ALARMING, ALARM = {"watch", "retrain"}, "monitor "
 VERDICT_LOOK_S, KEEP_S = 10.0, 600.0  # between two looks at the verdicts, and two writings of what was learnt
 
 
-class Watching:
+class MonitorRunner:
     """A monitor for each controller that comes to the plant; one that was here before goes on where it was."""
 
     def __init__(self, controller: Controller, recorder: Recorder) -> None:

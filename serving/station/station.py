@@ -41,7 +41,7 @@ from loopwright.serving.station.build_loop import (
 from loopwright.serving.station.control import Answer, Control
 from loopwright.serving.station.housekeeping import LinePrinter, PeriodicTask
 from loopwright.serving.station.mv_lock import Lease, Locks
-from loopwright.serving.station.recorder import Recorder, Watching
+from loopwright.serving.station.recorder import MonitorRunner, Recorder
 from loopwright.serving.station.requests import Change, NodeRequests, Request, change, require_proven
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.station.views import Snapshot, about, picture, state
@@ -111,7 +111,7 @@ class Station:
         self.recorder = Recorder(self.journal, tell, settings.speed)
         self.recorder.end_old_alarms()
         self.locks = Locks(self.lease, self.recorder)
-        self.watching = Watching(self.controller, self.recorder)
+        self.watching = MonitorRunner(self.controller, self.recorder)
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
         self.snapshot: Snapshot | None = None  # of the last scan; all that other threads read of it

@@ -23,7 +23,7 @@ from loopwright.serving import Controller, LoopError
 from loopwright.serving.journal import EventEntry, Journal, JournalReader, ScanEntry
 from loopwright.serving.page.live import Live
 from loopwright.serving.page.process import Page, PageProcess
-from loopwright.serving.page.trend import Modes, Thinned, trend
+from loopwright.serving.page.trend import BinnedExtremes, Modes, trend
 
 pytest_plugins = ["small_laws"]
 
@@ -310,7 +310,7 @@ def test_thinning_keeps_the_extremes_of_every_bin(seed: int) -> None:
     times = np.sort(rng.uniform(0, 1000, n))
     values = rng.normal(size=n).cumsum()
     values[rng.random(n) < 0.2] = np.nan
-    thinned = Thinned(0.0, 1000.0, points)
+    thinned = BinnedExtremes(0.0, 1000.0, points)
     for part in np.array_split(np.arange(n), 7):
         thinned.add(times[part], {"pv a": values[part]})
     at, columns = thinned.rows()

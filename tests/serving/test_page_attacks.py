@@ -204,7 +204,7 @@ def serving_here(loop: FakeLoop) -> Iterator[tuple[PageApp, Browser, uvicorn.Ser
         port = int(listening.getsockname()[1])
         config = uvicorn.Config(
             app.asgi([f"127.0.0.1:{port}"], "http"),
-            http=access.Impatient, ws="none", log_config=None, access_log=False, timeout_graceful_shutdown=1,
+            http=access.TimedConnection, ws="none", log_config=None, access_log=False, timeout_graceful_shutdown=1,
         )  # fmt: skip
         server = uvicorn.Server(config)
         thread = threading.Thread(target=asyncio.run, args=(server.serve([listening]),), daemon=True)

@@ -60,7 +60,7 @@ EPS = 0.03  # scaled: what lies beyond a limit by less counts by its square
 SOFT = 0.003  # scaled: where the curvature begins, so that the law has no jump at a limit
 
 
-class Push(NamedTuple):
+class LimitCost(NamedTuple):
     """For each output over the horizon: the weight of a quadratic that stands for the limits' cost, and its slope."""
 
     weight: Tensor  # (..., 1, N n_cv)
@@ -93,12 +93,12 @@ class SoftLimits(nn.Module):
         self.register_buffer("high", high.repeat(horizon))
         hold_numbers(self, price=price, soft=SOFT, eps_squared=EPS**2)
 
-    def forward(self, y: Tensor) -> Push:
+    def forward(self, y: Tensor) -> LimitCost:
         """The push on outputs y (..., 1, N n_cv), scaled."""
         beyond = y - torch.minimum(torch.maximum(y, self.low), self.high)
         size = beyond.abs()
         weight = self.price * size / ((size + self.soft) * torch.sqrt(size * size + self.eps_squared))
-        return Push(weight, weight * beyond)
+        return LimitCost(weight, weight * beyond)
 
 
 @dataclass(frozen=True, slots=True)

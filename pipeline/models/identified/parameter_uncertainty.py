@@ -30,7 +30,7 @@ LEFT_OUT = 0.05
 """Share of the models' weight left out at either end of their answers: one poor model of many vetoes nothing."""
 
 
-class Doubt(NamedTuple):
+class ParameterSpread(NamedTuple):
     """Standard deviations over models that are as likely as the fitted one, see ``spread``."""
 
     gain: Array  # (n_mv,) relative, of the answer that each MV moves most
@@ -38,7 +38,7 @@ class Doubt(NamedTuple):
     dead: Array  # (1,) of the dead time [periods]
 
 
-def doubt_of(curves: Array, n_mv: int) -> Doubt:
+def doubt_of(curves: Array, n_mv: int) -> ParameterSpread:
     """From the models' scaled step responses (members, n_v, length, n_y), the MVs' first.
 
     For each MV the output counts that it moves most. Speed and dead time are those of the MV that is least certain,
@@ -61,7 +61,7 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
         )
         taken = rises[:, 1] - rises[:, 0]
         pace[j], dead[j] = spread(taken) / max(float(np.median(taken)), 1.0), spread(rises[:, 0])
-    return Doubt(gain, np.array([pace.max()]), np.array([dead.max()]))
+    return ParameterSpread(gain, np.array([pace.max()]), np.array([dead.max()]))
 
 
 def _strongest(curves: Array) -> Array:
