@@ -42,7 +42,7 @@ DEAD_S, NOISE = 5, 0.1
 PHASES: tuple[tuple[str, Any, str], ...] = (
     ("reading", export_params, "read_export"),
     ("screening of readings", screening, "flag_bad_readings"),
-    ("remarks on readings", screening, "of_series"),
+    ("remarks on readings", screening, "check_readings"),
     ("settling", screening, "pace_of"),
     ("resampling", screening, "resampled"),
     ("pulses", screening, "remove_pulses"),

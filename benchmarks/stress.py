@@ -66,11 +66,11 @@ def alone(file: Path, seconds: float) -> tuple[Stress, float]:
 
 def law_share(stress: Stress) -> float:
     """Share of a batch's time that is the steps of the law, its session included."""
-    from loopwright.serving.rows import ControllerRows
+    from loopwright.serving.vectorized_controller import VectorizedController
 
-    whole, spent = ControllerRows.step, 0.0
+    whole, spent = VectorizedController.step, 0.0
 
-    def timed(rows: ControllerRows, **given: np.ndarray) -> object:
+    def timed(rows: VectorizedController, **given: np.ndarray) -> object:
         nonlocal spent
         begun = time.perf_counter()
         try:
@@ -78,11 +78,11 @@ def law_share(stress: Stress) -> float:
         finally:
             spent += time.perf_counter() - begun
 
-    ControllerRows.step = timed  # type: ignore[method-assign, assignment]
+    VectorizedController.step = timed  # type: ignore[method-assign, assignment]
     try:
         taken = seconds_of(stress, range(100))
     finally:
-        ControllerRows.step = whole  # type: ignore[method-assign]
+        VectorizedController.step = whole  # type: ignore[method-assign]
     return spent / taken
 
 

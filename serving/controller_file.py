@@ -1,4 +1,4 @@
-"""Bytes of a controller file: the digest at its end, and the JSON file beside it."""
+"""Bytes of a controller file: the digest at its end, and the JSON file beside it; other files, read with a limit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from loopwright.serving.errors import ArtifactError
+from loopwright.serving.errors import ArtifactError, SignatureError
 from loopwright.serving.graph import audit
 from loopwright.serving.manifest import MANIFEST_KEY, MAX_CHARACTERS, Manifest, strictly
 
@@ -141,3 +141,23 @@ _KINDS: tuple[tuple[Callable[[int], bool], str], ...] = (
 def without_waiting(path: str, flags: int) -> int:
     """Open a path, for ``open``; a pipe without a writer does not block: it may have been put there since a check."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+# -------------------------------------------------------------------------- files of somebody else's, read with a limit
+def contents(path: Path, most: int) -> bytes:
+    """The bytes of a regular file of at most ``most`` bytes; FileNotFoundError where there is none.
+
+    Raises SignatureError for anything else: a pipe would be waited for, and a device may never end.
+    """
+    try:
+        with open(path, "rb", opener=without_waiting) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise SignatureError(f"{path} is no regular file")
+            data = file.read(most + 1)
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a path with a NUL in it
+        raise SignatureError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if len(data) > most:
+        raise SignatureError(f"{path} has more than the {most} bytes that it may have")
+    return data

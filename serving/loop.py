@@ -106,7 +106,7 @@ class ControlLoop:
         if not 0 <= transfer_s < inf:
             raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         manifest = controller.manifest
-        self._charge = ActiveController(controller, default_guards if guards is None else guards)
+        self._active = ActiveController(controller, default_guards if guards is None else guards)
         self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
         self.endpoint = endpoint
         self.recover_after = recover_after
@@ -133,22 +133,22 @@ class ControlLoop:
     @property
     def controller(self) -> Controller:
         """The controller in charge."""
-        return self._charge.controller
+        return self._active.controller
 
     @property
     def successor(self) -> Successor | None:
         """The controller that is tried beside it, see ``swap``."""
-        return self._charge.successor
+        return self._active.successor
 
     @property
     def replaced(self) -> Controller | None:
         """The controller that was in charge before it."""
-        return self._charge.replaced
+        return self._active.replaced
 
     @property
     def guards(self) -> tuple[Guard, ...]:
         """The guards of the controller in charge."""
-        return self._charge.guards
+        return self._active.guards
 
     def swap(self, controller: Controller, trial: int) -> None:
         """Try ``controller`` for ``trial`` good scans in a row beside the one in charge, then give it the plant.
@@ -156,11 +156,11 @@ class ControlLoop:
         Until then its MV stands in ``Command.successor_mv``. It may read fewer PVs and measured disturbances than the
         loop does. LoopError where its period, set points or MVs are others, or it has a signal that the loop has not.
         """
-        self._charge.swap(controller, trial, self.manifest)
+        self._active.swap(controller, trial, self.manifest)
 
     def keep(self) -> None:
         """End the trial of a successor; the controller in charge stays."""
-        self._charge.successor = None
+        self._active.successor = None
 
     # ------------------------------------------------------------------ operator
     @property
@@ -227,7 +227,7 @@ class ControlLoop:
     # ------------------------------------------------------------------ one scan
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
-        reason = self._charge.refusal(sample)
+        reason = self._active.refusal(sample)
         self._refused_why = ""
         self._applied.arrived()
         shown = self._applied.look(sample, self._mv, refused=bool(reason))
@@ -250,7 +250,7 @@ class ControlLoop:
                 applied = self._applied.read_back(sample, self._mv)
             if isnan(self._mv[0]):
                 self._mv = applied.copy()
-            step = self._charge.step(sample, self._sp, applied)
+            step = self._active.step(sample, self._sp, applied)
         except Exception as error:  # the plant needs an MV after any error
             if self.mode in {Mode.AUTO, Mode.SHADOW}:
                 self._mv = applied
@@ -264,7 +264,7 @@ class ControlLoop:
             self._mv = applied.copy()
         self._mv = self._hand.toward(self._mv, self.controller.manifest.mv)
         before = self.controller
-        beside = self._charge.beside(sample, self._sp, applied)
+        beside = self._active.beside(sample, self._sp, applied)
         if self.controller is not before:
             self._transfer.begin()
         self._lasting()
@@ -299,12 +299,12 @@ class ControlLoop:
     def gap(self, periods: int) -> None:
         """So many periods passed without a scan; the law starts cold after more than ``max_gap``."""
         if periods > self.max_gap:
-            self._charge.begin_cold(f"{periods} periods were missed")
+            self._active.begin_cold(f"{periods} periods were missed")
             self._transfer.begin()  # a law that starts cold may want another MV at once
 
     def _lose(self, reason: str) -> None:
         """No past any more; in AUTO a fault."""
-        self._charge.forget(reason)
+        self._active.forget(reason)
         self._mode.lose(reason)
 
     def _lasting(self, *, moves: bool = True) -> None:

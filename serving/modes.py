@@ -143,7 +143,7 @@ class LoopMode:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """The result of one scan. ``reason`` names a fault; it is empty without one.
+    """The result of one scan. ``fault`` says why no MV of the law was used or written; it is empty without one.
 
     A host that runs the loop itself writes ``mv`` where ``writes`` is true: not in SHADOW, and not while ``mv`` is NaN
     because no sample has told yet where the MV stands. Where ``hand_back`` is true, it gives the plant back to the
@@ -156,7 +156,7 @@ class Command:
     mv: Array  # shape: (n_mv,), to be written; NaN while it is not known where the MV stands
     law_mv: Array | None  # the law's MV, also in MANUAL; None if the law was not stepped or its step failed
     info: Array | None  # shape: (n_info,)
-    reason: str = ""
+    fault: str = ""
     successor_mv: Array | None = None  # shape: (n_mv,), of a controller that is tried beside the law; else None
     hand_back: bool = False
 

@@ -75,7 +75,7 @@ class StandingMv:
 UNREAD = "the last MV did not reach the plant: nothing is written before a good read-back tells where the MV stands"
 
 
-class Shown(NamedTuple):
+class ShownMV(NamedTuple):
     """The MV as one sample shows it."""
 
     applied: Array | None = None  # shape: (n_mv,), the read-back within its range; None where there is no sound one
@@ -111,7 +111,7 @@ class AppliedMV:
         """A scan begins, and nothing was heard of a loss."""
         self._standing.commanded(self._given, written=self._written)
 
-    def look(self, sample: Sample, last: Array, *, refused: bool) -> Shown:
+    def look(self, sample: Sample, last: Array, *, refused: bool) -> ShownMV:
         """The MV by the sample; ``last`` is the last command (n_mv,), ``refused`` whether the sample is of no use.
 
         A refused sample without a read-back tells nothing; a good one says that nothing is read back at all. Where it
@@ -124,11 +124,11 @@ class AppliedMV:
             return self._unread(sample)
         if applied is not None:
             self._is_read = True
-            return Shown(applied, self._standing.seen(applied))
+            return ShownMV(applied, self._standing.seen(applied))
         if refused:
             return self._unread(sample)
         self._standing.lost = False
-        return Shown()
+        return ShownMV()
 
     def read_back(self, sample: Sample, last: Array) -> Array:
         """The applied MV (n_mv,) within its range; the last command if there is no read-back.
@@ -156,15 +156,15 @@ class AppliedMV:
                 return np.clip(applied, lows, highs)
         return applied
 
-    def _unread(self, sample: Sample) -> Shown:
+    def _unread(self, sample: Sample) -> ShownMV:
         """No sound read-back: after a loss nothing is written, unless the plant never reads anything back."""
         if not self.lost:
-            return Shown()
+            return ShownMV()
         outside = self._outside(sample)
         if outside:
-            return Shown(silent=reworded(outside, f"{outside}: nothing is written before it is back"), outside=True)
+            return ShownMV(silent=reworded(outside, f"{outside}: nothing is written before it is back"), outside=True)
         is_read = self._is_read or getattr(sample, "mv_applied", None) is not None
-        return Shown(silent=UNREAD if is_read else "")
+        return ShownMV(silent=UNREAD if is_read else "")
 
     def _outside(self, sample: Sample) -> str:
         """Why no loop can have commanded the MV that the plant has; empty where the sample does not tell."""

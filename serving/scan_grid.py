@@ -99,7 +99,7 @@ def run_on_grid(
                 reason = reason or f"before failed: {named(error)}"
         sample, command = _scan_once(loop, endpoint, reason)
         scans += 1
-        faults += bool(command.reason)
+        faults += bool(command.fault)
         if observe is not None:
             failures.call("observe", observe, sample, command)
         if until is not None and failures.call("until", _true, until, command):

@@ -12,8 +12,7 @@ import numpy as np
 from loopwright.serving import Controller
 from loopwright.serving.errors import NotProvenError
 from loopwright.serving.journal import EventEntry, Journal, ScanEntry
-from loopwright.serving.page.process import PageProcess
-from loopwright.serving.page.settings import Page
+from loopwright.serving.page.process import Page, PageProcess
 from loopwright.serving.station.control import Control
 
 BEGIN = 1_790_000_000.0

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from loopwright.pipeline.models import Model
-from loopwright.pipeline.models.local.local_models import LocalModels
-from loopwright.pipeline.models.local.local_models_part import operating_cv
+from loopwright.pipeline.models.local_models import LocalModels
+from loopwright.pipeline.models.local_models_part import operating_cv
 from loopwright.pipeline.plants.equations import EquationPlant
 
 POINTS = ({"q_c": 110.0}, {"T": 442.0}, {"T": 450.0}, {"T": 465.0}, {"T": 481.0})

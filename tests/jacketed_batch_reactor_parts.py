@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
 from loopwright.pipeline.models import Model
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.hybrid_fuzzy import HybridFuzzy
 from loopwright.pipeline.plants.equations import EquationPlant
 
 LAWS = ("fuzzy_feedforward", "fuzzy_feedforward_pi", "fuzzy_feedforward_observer")

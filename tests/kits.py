@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import atexit
 import json
+import re
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from subprocess import CompletedProcess
 from tempfile import mkdtemp
 from typing import Any
 
@@ -115,3 +118,78 @@ DAMAGES = {
     "start": a_start_without_information,
     "moved": an_old_mv_written_over_a_new_one,
 }
+
+
+# ------------------------------------------------------------------------- what every host's program must do, whichever
+PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
+Run = Callable[..., CompletedProcess[str]]
+"""A host's program with these words as its arguments."""
+
+
+def answers_refusals_and_disturbances(run: Run, file: Path, answers: Path) -> None:
+    """No shipped controller has measured disturbances or leaves its range; the one in ``file`` does both."""
+    vectors = json.loads((kit_of(file) / VECTORS).read_text())
+    refused = Counter(row.get("refused", "") for row in vectors["steps"])
+    assert min(refused["output"], refused["input"], refused[""]) >= 15
+    done = run("--conformance", kit_of(file), answers)
+    assert done.returncode == 0, done.stdout + done.stderr
+    verdict = verdict_on(file, answers)
+    assert verdict.identical, verdict.text()
+
+
+def fails_on_a_damaged_kit(run: Run, damage: str, differences: str, folder: Path) -> None:
+    """``differences``: the largest difference in one step and chained, and how many answers are wrong."""
+    done = run("--conformance", spoilt(PID, folder, DAMAGES[damage]))
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert re.search(f"largest difference {differences} wrong", done.stdout), done.stdout
+
+
+def refuses_an_old_kit(run: Run, folder: Path) -> None:
+    """One line says what to do."""
+    done = run("--conformance", spoilt(PID, folder, an_old_version))
+    assert (done.returncode, done.stdout) == (2, ""), done.stdout + done.stderr
+    wanted = "the kit has the version 3, not 4: write it again with loopwright conformance FILE.onnx KIT"
+    assert done.stderr == f"error: {wanted}\n"
+
+
+def scans_of_a_loop(run: Run) -> list[list[str]]:
+    """Words of each scan of a loop of 40 scans at most, 20 ms apart: scan, lateness [ms], ..., mode, MV."""
+    done = run(kit_of(PID) / "pid.onnx", "40", "0.02")
+    assert done.returncode == 0, done.stderr
+    rows = [line.split() for line in done.stdout.splitlines()]
+    places = [int(row[0]) for row in rows]
+    assert places == sorted(set(places))  # a busy machine leaves some out, also at the start
+    assert places[0] >= 0
+    assert len(places) > 1
+    assert all(0 <= float(row[1]) < 20 for row in rows)  # a later scan is one of the next period
+    assert {row[4] for row in rows} == {"AUTO"}
+    return rows
+
+
+def wrong_file(what: str, folder: Path) -> Path:
+    """A controller file in ``folder`` that a host must refuse, by itself or by the manifest beside it."""
+    for suffix in (".onnx", ".json"):
+        shutil.copy(kit_of(PID) / f"pid{suffix}", folder)
+    file, manifest = folder / "pid.onnx", folder / "pid.json"
+    text = manifest.read_text()
+    {
+        "cut": lambda: manifest.write_text(text[:700]),
+        "foreign": lambda: shutil.copy(next(f for f in SHIPPED if f.stem == "inc").with_suffix(".json"), manifest),
+        "changed": lambda: file.write_bytes(file.read_bytes() + b"x"),
+        "schema": lambda: manifest.write_text(text.replace('"schema": 1', '"schema": 2')),
+        "sizes": lambda: manifest.write_text(text.replace('"n_state": 7', '"n_state": 8')),
+        "range": lambda: manifest.write_text(text.replace('"high": 500.0', '"high": 5000.0')),
+        "unlimited": lambda: manifest.write_text(text.replace('"high": 500.0', '"high": 500.0, "max_move": 1')),
+        "without": lambda: manifest.write_text(text.replace('"pv": [', '"PV": [')),
+        "missing": manifest.unlink,
+    }[what]()
+    return file
+
+
+def refuses_in_one_line(run: Run, file: Path, words: str) -> None:
+    """A file that is not right."""
+    done = run(file, "1", "0.01")
+    assert (done.returncode, done.stdout) == (2, ""), done.stdout + done.stderr
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert words in done.stderr

@@ -202,7 +202,7 @@ class RunningLoop:
 
     def since(self, start: int, mode: Mode) -> list[Command]:
         """Its scans from a place on that had a mode and no fault."""
-        return [c for c in self.commands[start:] if c.mode is mode and not c.reason]
+        return [c for c in self.commands[start:] if c.mode is mode and not c.fault]
 
     def becomes(self, mode: Mode, seconds: float = 30.0, scans: int = 1) -> int:
         """Wait until so many scans in a row have a mode; the place of the first of them from now."""
@@ -212,7 +212,7 @@ class RunningLoop:
             last = self.commands[start:][-scans:]
             return len(last) == scans and all(c.mode is mode for c in last)
 
-        assert within(seconds, there), (mode, self.told, [(c.mode, c.reason) for c in self.commands[start:]][-10:])
+        assert within(seconds, there), (mode, self.told, [(c.mode, c.fault) for c in self.commands[start:]][-10:])
         return next(i for i, c in enumerate(self.commands[start:]) if c.mode is mode)
 
     def scans(self) -> list[ScanEntry]:

@@ -56,18 +56,18 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 STEPS_OF_GATE, gate.GATE_STEPS = gate.GATE_STEPS, 60
 
 # What a law's params need beside their defaults, and what lets it be designed quickly.
-QUICK: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
+QUICK_PARAMS: dict[str, dict[str, Any]] = {name: dict(required(name)) for name in LAWS}
 # Lower gains than the defaults, whose loops test_units_of_laws.py runs: over quick networks of an unstable plant and
 # inputs drawn over whole ranges the defaults keep the MV at its ends, where laws cannot be told apart.
 CALM: dict[str, Any] = {"penalty": 1.0, "stiffness": 1e-3, "gain_high": (10.0,) * 3, "slope_min": 1e-3}
 for _name in ("linearized_pid", "gauss_newton_pid", "minimum_variance", "recursive_pid", "self_tuning_pid"):
     _known = {f.name for f in dataclasses.fields(LAWS[_name].Params)}
     _calm = {**CALM, "penalty": 0.1} if _name in ("gauss_newton_pid", "minimum_variance") else CALM
-    QUICK[_name] |= {key: value for key, value in _calm.items() if key in _known}
-QUICK["predictive"] |= {"horizon": 8, "moves": 4}
-QUICK["pid"] |= {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613}
+    QUICK_PARAMS[_name] |= {key: value for key, value in _calm.items() if key in _known}
+QUICK_PARAMS["predictive"] |= {"horizon": 8, "moves": 4}
+QUICK_PARAMS["pid"] |= {"tuning": "imc", "lambda_s": 1.6, "operating_cv": 0.66613}
 for _name in ("model_reference", "model_reference_two_error", "pi_reference"):
-    QUICK[_name] |= reversible_cstr_parts.QUICK
+    QUICK_PARAMS[_name] |= reversible_cstr_parts.QUICK_PARAMS
 ADAPTIVE = {"adaptive": True, "penalty_start": 20.0, "penalty_low": 0.1, "eps_high": 0.2, "eps_low": 0.05}
 # Forms of a law that its defaults do not reach, under the contract too.
 VARIANTS: dict[str, list[dict[str, Any]]] = {
@@ -205,7 +205,7 @@ def make_law() -> LawFactory:
 
     def make(name: str, **params: Any) -> ControlLaw:
         cls, plant = LAWS[name], plant_of(name)
-        given = cls.Params(**{**QUICK[name], **params})
+        given = cls.Params(**{**QUICK_PARAMS[name], **params})
         return cls.design(given, quick_parts(plant.name), plant.signals, plant).eval()
 
     return make

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopwright.pipeline.laws.reference.reference_loops import Training
+from loopwright.pipeline.laws.reference.reference_law import Training
 from loopwright.pipeline.models import Model
 from loopwright.pipeline.models.state_space import StateSpace
 from loopwright.pipeline.models.training.fit import LevenbergMarquardt
@@ -12,7 +12,7 @@ from loopwright.pipeline.models.training.objectives import Samples
 from loopwright.pipeline.plants.equations import EquationPlant
 
 # What the laws of the reactor need to be trained quickly: good enough to hold their contract.
-QUICK = {"training": Training(hidden=4, lanes=12, holds=1, hold=40, noise=0.002, iterations=4, restarts=1)}
+QUICK_PARAMS = {"training": Training(hidden=4, lanes=12, holds=1, hold=40, noise=0.002, iterations=4, restarts=1)}
 LOW, HIGH = np.array([0.25, 365.0]), np.array([0.65, 430.0])
 
 

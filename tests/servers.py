@@ -18,7 +18,7 @@ import requests
 from processes import within
 
 from loopwright.pipeline.engine.cluster import STAGES
-from loopwright.pipeline.engine.parent_death import end_with_parent
+from loopwright.pipeline.engine.dvc import end_with_parent
 
 ROOT = Path(__file__).parents[1]
 BUCKETS = ("mlflow", "dvc")

@@ -45,7 +45,7 @@ from untouched import UNTOUCHED
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.laws.base import ControlLaw
-from loopwright.pipeline.plants.perturbed import SpoiltPlant
+from loopwright.pipeline.plants.simulator import PerturbedPlant
 
 ROWS, CLOSED_ROWS = 8_000, 12_000
 GROUPS = {
@@ -63,7 +63,7 @@ HEAD = (
 def pid_of(plant: OwnPlant) -> ControlLaw | None:
     """The PID tuned on the true plant; None where it controls no such plant."""
     pid = LAWS["pid"]
-    simulated = SpoiltPlant(plant, {}) if len(plant.mv_signals) == 1 else plant
+    simulated = PerturbedPlant(plant, {}) if len(plant.mv_signals) == 1 else plant
     try:
         return pid.design(pid.Params(), {}, plant.signals, simulated).eval()
     except PipelineError as error:

@@ -30,7 +30,7 @@ INWARD = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the way from the visited range's midd
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
+class OperatingRange:
     """Set points that can be held jointly, and how long they are held, from a model of the plant and its record.
 
     A CV that settles under constant MVs takes the set points of rests under MVs drawn over the visited range; MVs

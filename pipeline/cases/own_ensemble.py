@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from loopwright.pipeline.cases.operating_range import Reach, visited_mv
+from loopwright.pipeline.cases.operating_range import OperatingRange, visited_mv
 from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_ARRAYS, MODEL_SET, Doubts, OwnPlant, doubted, suits
 from loopwright.pipeline.config.exports import is_exported
 from loopwright.pipeline.errors import ModelError, PlantError, RecordError
@@ -111,9 +111,9 @@ class OwnEnsemble(Case):
         return plant if rest is None else plant.begun_at(*rest)
 
     @cached_property
-    def reach(self) -> Reach:
+    def reach(self) -> OperatingRange:
         """The part of its range that the record visited, by the law's model."""
-        return Reach(self._model, self.record)
+        return OperatingRange(self._model, self.record)
 
     @cached_property
     def record(self) -> Record:

@@ -14,8 +14,7 @@ from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant, longest_memory
 from loopwright.pipeline.plants.noise import deviation
-from loopwright.pipeline.plants.perturbed import SpoiltPlant, likely_error
-from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
+from loopwright.pipeline.plants.simulator import Array, PerturbedPlant, Signals, Simulator, likely_error
 from loopwright.pipeline.simulation.scenario import Scenario
 
 # Least errors: a plant does not stay as its record found it. Relative; of the dead time in periods.
@@ -182,7 +181,7 @@ class OwnPlant(IdentifiedPlant):
 
     def variations(self) -> tuple[Simulator, ...]:
         """The model itself, and with errors of gain, speed and dead time."""
-        return (self, *(SpoiltPlant(self, wrong.parameters) for wrong in errors_of(self)))
+        return (self, *(PerturbedPlant(self, wrong.parameters) for wrong in errors_of(self)))
 
 
 def errors_of(plant: OwnPlant) -> list[GoneWrong]:

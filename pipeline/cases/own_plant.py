@@ -53,8 +53,8 @@ GATE_WITH_MEASURED = {"held_out": 0.5, "held_out_noise": 0.2, LOADED: 0.1, MEASU
 class OwnCase(OwnEnsemble):
     """Tests of an own plant: on models of its record that had no part in tuning, and on such models spoilt.
 
-    Set points are what the model of each test can hold within the range that the record visited (``Reach``). Errors
-    of several CVs count in % of their ranges. The subclass of a plant states its signals, see ``own_case``.
+    Set points are what the model of each test can hold within the range that the record visited (``OperatingRange``).
+    Errors of several CVs count in % of their ranges. The subclass of a plant states its signals, see ``own_case``.
     """
 
     development_seeds: ClassVar[tuple[int, ...]] = (1, 2, 3, 4)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT, SCALES, VISITED_MV, Reach, held_at
+from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT, SCALES, VISITED_MV, OperatingRange, held_at
 from loopwright.pipeline.evaluation.case import Array
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.records.record import Record
@@ -21,7 +21,7 @@ LEAST_LOAD = 0.01  # of that: a smaller load is no test
 LOAD_ROOM = 0.05  # of an MV's range, at each end: what holding a disturbance leaves for a controller to act in
 
 
-def load_size(reach: Reach, cv: int) -> float:
+def load_size(reach: OperatingRange, cv: int) -> float:
     """Largest change of a CV [its unit] by a load within a hold, if no controller acts.
 
     ``TEST_LOAD`` of the record's standard deviations; on a quiet record with much noise ``ABOVE_NOISE`` of the noise's,
@@ -30,7 +30,7 @@ def load_size(reach: Reach, cv: int) -> float:
     return max(TEST_LOAD * float(reach.record.pv[:, cv].std()), ABOVE_NOISE * float(reach.model.noise_std[cv]))
 
 
-def whole_load(reach: Reach, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float:
+def whole_load(reach: OperatingRange, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float:
     """The load [CV a period] that moves a CV of a plant by ``load_size`` at most.
 
     An integrating CV moves as far in a third of a hold: there a load is a rate, and three times that is no rest.
@@ -44,7 +44,7 @@ def whole_load(reach: Reach, plant: IdentifiedPlant, cv: int, upwards: bool = Tr
     return (1 if upwards else -1) * tried * size / float(np.max(np.abs(loaded - free)))
 
 
-def held_load(reach: Reach, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float | None:
+def held_load(reach: OperatingRange, plant: IdentifiedPlant, cv: int, upwards: bool = True) -> float | None:
     """The load [CV a period] on a CV in a test: ``whole_load``, or as much of it as MVs within their ranges can hold.
 
     None where they hold not even ``LEAST_LOAD`` of it.

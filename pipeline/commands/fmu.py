@@ -10,8 +10,7 @@ from pathlib import Path
 from loopwright.pipeline.errors import HostError
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.hosts.fmu.compiling import toolchain
-from loopwright.pipeline.hosts.fmu.folder import pack, write_folder
-from loopwright.pipeline.hosts.fmu.gate import check, problems
+from loopwright.pipeline.hosts.fmu.folder import check, pack, problems, write_folder
 from loopwright.serving.controller import Controller
 
 MEGABYTE = 1e6  # bytes

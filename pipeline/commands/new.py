@@ -32,7 +32,6 @@ from loopwright.pipeline.commands.own_plant.knowledge import (
     signals_as_tags,
     stated_of,
 )
-from loopwright.pipeline.commands.own_plant.printed import tell
 from loopwright.pipeline.commands.own_plant.replaced import (
     REFUSED,
     check_replaceable,
@@ -55,7 +54,7 @@ from loopwright.pipeline.historian.screening import Refusal, Screened, refusal
 from loopwright.pipeline.historian.step_test import planned
 from loopwright.pipeline.plants.simulator_file import FileSimulator, is_fmu
 from loopwright.pipeline.records.record import Record
-from loopwright.pipeline.report.screening import write_page
+from loopwright.pipeline.report.screening import tell, write_page
 from loopwright.pipeline.stages.paths import DATA, WORK
 from loopwright.serving.words import plain
 

@@ -15,8 +15,7 @@ from typing import Any
 
 from loopwright.pipeline.config.params import entries, sections, sections_of
 from loopwright.pipeline.engine.cluster import STAGES as KINDS
-from loopwright.pipeline.engine.dvc import affected, ask, ask_in_turn, environment
-from loopwright.pipeline.engine.parent_death import end_with_parent, hear_no_interrupt
+from loopwright.pipeline.engine.dvc import affected, ask, ask_in_turn, end_with_parent, environment, hear_no_interrupt
 from loopwright.pipeline.engine.run_mark import run_marked
 from loopwright.pipeline.errors import ParamsError, PipelineError, nearest
 from loopwright.pipeline.report.results import show_results, without_controller

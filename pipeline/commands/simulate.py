@@ -163,9 +163,9 @@ def close_loop(
         history.sp.append(command.sp)
         history.measured.append(sample.pv)
         history.mv.append(command.mv)
-        history.reason.append(command.reason)
+        history.reason.append(command.fault)
         values = np.concatenate([command.sp, sample.pv, command.mv])
-        show(k * period, command.mode.value, values, command.reason, marks.get(k))
+        show(k * period, command.mode.value, values, command.fault, marks.get(k))
 
     with view_of(plant, title, n * period, sys.stdout) as show:
         loop.run(n, before=ending(before), observe=ending(observe), until=lambda _: len(failed) > 0)

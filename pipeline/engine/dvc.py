@@ -1,17 +1,19 @@
-"""DVC as this program starts it: with this Python, and deaf to a Ctrl-C that is for the program itself."""
+"""DVC as this program starts it: with this Python, deaf to a Ctrl-C that is for the program, and ended with it."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from configparser import ConfigParser
 from pathlib import Path
 
-from loopwright.pipeline.engine.parent_death import end_with_parent, hear_no_interrupt
 from loopwright.pipeline.errors import PipelineError
 
 PYTHON = (sys.executable, "-P")  # no package comes from the folder in which somebody stands: a numpy.py there would run
@@ -132,3 +134,26 @@ def _reason(text: str) -> str:
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     own = [line for line in lines if not line.startswith(OF_DVC)]
     return (own or lines or ["no output"])[-1]
+
+
+# -------------------------------------------------------------- processes that do not outlive the one that started them
+_SET_PARENT_DEATH_SIGNAL = 1  # prctl's PR_SET_PDEATHSIG
+
+
+def end_with_parent(parent: int | None = None) -> None:
+    """Have the system end this process (SIGTERM) when its parent ends; does nothing outside Linux.
+
+    ``parent`` is the parent's process id where the caller knows it: a parent that has ended already
+    sends no signal any more.
+    """
+    if sys.platform != "linux":
+        return
+    with contextlib.suppress(OSError, AttributeError):  # a C library without prctl
+        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGTERM)
+    if parent is not None and os.getppid() != parent:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def hear_no_interrupt() -> None:
+    """Ignore Ctrl-C in this process and in whatever it starts: the one that started it ends them all, in order."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

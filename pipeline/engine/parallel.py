@@ -15,9 +15,9 @@ import cloudpickle
 
 from loopwright.pipeline.engine.cluster import address, connected
 from loopwright.pipeline.engine.fingerprint import fingerprint
-from loopwright.pipeline.engine.folder import Changes, Files, apply
 from loopwright.pipeline.engine.pieces import WorkerTask, alone, current_task, lost, on_worker
 from loopwright.pipeline.engine.progress import piece, progress_bar, within
+from loopwright.pipeline.engine.stage_files import Changes, Files, apply
 from loopwright.pipeline.errors import PipelineError
 
 if TYPE_CHECKING:

@@ -38,9 +38,8 @@ import yaml
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from loopwright.pipeline.engine.dvc import COMMAND, environment
+from loopwright.pipeline.engine.dvc import COMMAND, end_with_parent, environment
 from loopwright.pipeline.engine.output import BARS, MARK
-from loopwright.pipeline.engine.parent_death import end_with_parent
 from loopwright.pipeline.engine.start import DOOR
 
 # --------------------------------------------------------------------------------------------------- stages that begin

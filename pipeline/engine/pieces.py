@@ -22,8 +22,8 @@ from threadpoolctl import ThreadpoolController
 
 from loopwright.pipeline.engine.cluster import address, unwatched
 from loopwright.pipeline.engine.fingerprint import difference, fingerprint
-from loopwright.pipeline.engine.folder import Files, NewFolder
 from loopwright.pipeline.engine.progress import lines_anew
+from loopwright.pipeline.engine.stage_files import Files, NewFolder
 from loopwright.pipeline.errors import PipelineError
 
 if TYPE_CHECKING:

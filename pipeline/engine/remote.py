@@ -17,9 +17,8 @@ from typing import Any
 
 from loopwright.pipeline.engine.cluster import connected, unwatched
 from loopwright.pipeline.engine.fingerprint import commit, difference, fingerprint, told
-from loopwright.pipeline.engine.folder import NewFolder, apply, read_files
 from loopwright.pipeline.engine.output import BARS
-from loopwright.pipeline.engine.stage_files import StageFiles
+from loopwright.pipeline.engine.stage_files import NewFolder, StageFiles, apply, read_files
 
 FAILED = 2  # exit status of a stage that was lost or that its worker refused; stderr says why
 

@@ -20,8 +20,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from loopwright.pipeline.engine.cluster import address, local_cluster, usual_workers
+from loopwright.pipeline.engine.dvc import end_with_parent
 from loopwright.pipeline.engine.output import outlet
-from loopwright.pipeline.engine.parent_death import end_with_parent
 from loopwright.pipeline.engine.start import DOOR
 from loopwright.pipeline.errors import PipelineError
 

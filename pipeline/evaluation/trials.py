@@ -246,7 +246,7 @@ class TrialPiece:
 
 
 @dataclass(frozen=True)
-class Ran:
+class TrialResult:
     """The result of a piece; the first sequence of a test alone brings its curve."""
 
     info: tuple[str, ...]
@@ -293,7 +293,7 @@ class Trials:
             return (self.case.development_noise,)
         return (False, True) if kind == "scored" and (form == BASE or self.case.development_noise) else (False,)
 
-    def run(self, piece: TrialPiece) -> Ran:
+    def run(self, piece: TrialPiece) -> TrialResult:
         """The closed loops of a piece."""
         test, case = self.sequences[piece.kind][piece.test][piece.place], self.case
         controller, seed = self._controller(piece.path), self.noise_seed + piece.place
@@ -306,14 +306,14 @@ class Trials:
         kept = piece.kind != DEVELOPED and piece.place == 0
         counts = one.lock_ups, one.swings, one.beyond_reach
         cycle = (one.cycle, one.first) if one.cycle is not None and piece.kind == "scored" else None
-        return Ran(controller.manifest.info, one.metrics, *counts, one.first if kept else None, reached, cycle)
+        return TrialResult(controller.manifest.info, one.metrics, *counts, one.first if kept else None, reached, cycle)
 
     def weight(self, piece: TrialPiece) -> float:
         """The cost of a piece beside others: its samples."""
         samples = self.sequences[piece.kind][piece.test][piece.place].samples
         return float(samples * (self.case.noise_draws if piece.noise else 1))
 
-    def trial(self, found: Mapping[TrialPiece, Ran]) -> Trial:
+    def trial(self, found: Mapping[TrialPiece, TrialResult]) -> Trial:
         """The trial of one file from its pieces, which are in their order."""
         metrics, locked_up, swings, beyond = dict[str, Metrics](), dict[str, int](), dict[str, int](), dict[str, int]()
         curves, sequences = dict[str, Trajectory](), dict[str, dict[str, Metrics]]()

@@ -69,7 +69,7 @@ READINGS_ELSEWHERE = 0.1
 MOVES_AHEAD = 25.0  # strength of moves still to come
 
 
-def of_series(series: Series, rate: TagSampling, role: str, period_s: float) -> list[Finding]:
+def check_readings(series: Series, rate: TagSampling, role: str, period_s: float) -> list[Finding]:
     """Compression, exception reporting, repeated values and coarse steps of one tag; ``period_s`` of the record."""
     if series.categories:
         return []

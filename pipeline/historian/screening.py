@@ -39,13 +39,13 @@ from loopwright.pipeline.historian.files.export import Export, Series
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import quantum
 from loopwright.pipeline.historian.notices import (
+    check_readings,
     of_files,
     of_grid,
     of_mode,
     of_models,
     of_notes,
     of_rows,
-    of_series,
     on_off,
     with_levels,
 )
@@ -137,7 +137,9 @@ def screen_export(
     findings += of_period(pace, period, step, given=period_s is not None)
     findings += of_rows(pvs, period, step)
     role_of = {t.tag: t.role for t in tags}
-    findings += [f for s in own.values() for f in of_series(s, sampling(s, period, hold_s), role_of[s.tag], period)]
+    findings += [
+        f for s in own.values() for f in check_readings(s, sampling(s, period, hold_s), role_of[s.tag], period)
+    ]
     steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
 
     counts_of: dict[str, dict[str, int]] = {}

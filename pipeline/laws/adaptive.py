@@ -11,9 +11,8 @@ from scipy.special import chdtri
 from torch import Tensor, nn
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.base import ControlLaw, hold_numbers, require_single_loop
+from loopwright.pipeline.laws.base import ControlLaw, OfRange, ascend, hold_numbers, in_units, require_single_loop
 from loopwright.pipeline.laws.gain_update import PidForm, gain_update
-from loopwright.pipeline.laws.scaled_defaults import OfRange, ascend, in_units
 from loopwright.pipeline.models.memory import Memory, Named, Slot
 from loopwright.pipeline.plants.simulator import Signals
 
@@ -246,7 +245,7 @@ class AdaptivePid(ControlLaw):
         The law's own slots; its info names after those of the gains.
     """
 
-    incremental = True
+    velocity_form = True
     looks_ahead = 1
     model: Any
 

@@ -1,17 +1,17 @@
-"""The base of the control laws: a torch module with explicit state, exported as one graph."""
+"""The base of the control laws: a torch module with explicit state, the actuator as it sees it, and scaled defaults."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from math import inf, isinf
 from typing import Any, ClassVar, Self, TypeAlias, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.actuator import Rates, rates_of
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 
@@ -101,7 +101,7 @@ class ControlLaw(nn.Module, ABC):
     Params: ClassVar[type[Any]]  # frozen dataclass: the law's parameters in params.yaml, with `mv_rate`
     # True if the law adds a move to the applied MV: its transfer from manual is bumpless, and a start at the set
     # point does not move the actuator. Other laws compute the MV without the applied one.
-    incremental: ClassVar[bool] = False
+    velocity_form: ClassVar[bool] = False
     # True if the law starts from an estimate of the plant's state, which the applied MV is a part of.
     estimates: ClassVar[bool] = False
     one_loop: ClassVar[bool] = True  # whether it controls one variable by one
@@ -167,3 +167,120 @@ class ControlLaw(nn.Module, ABC):
         if self.rate is not None:
             mv = torch.minimum(torch.maximum(mv, mv_applied - self.rate), mv_applied + self.rate)
         return torch.minimum(torch.maximum(mv, self.low), self.high)
+
+
+# ------------------------------------------------------------------------------------------- actuators as laws see them
+Rates: TypeAlias = float | tuple[float | None, ...] | None
+"""``mv_rate`` of a law [mv]: one number for all MVs, one for each with None for no limit, or None for none at all."""
+
+
+def rates_of(signals: Signals, mv_rate: Rates) -> tuple[float, ...] | None:
+    """The largest change of each MV a sample (n_mv,) [mv], infinite without a limit; None where no MV has one.
+
+    An MV's limit is the lesser of ``max_move`` of its signal and of ``mv_rate``. LawError for another number of rates
+    than of MVs, or for one that is not above 0.
+    """
+    names = ", ".join(s.name for s in signals.mv)
+    given = mv_rate if isinstance(mv_rate, tuple) else (mv_rate,) * len(signals.mv)
+    if len(given) != len(signals.mv):
+        raise LawError(
+            f"mv_rate has {len(given)} entries; give one number for all MVs, or one for each ({names}), null for no "
+            "limit"
+        )
+    if any(rate is not None and not rate > 0 for rate in given):
+        shown = list(mv_rate) if isinstance(mv_rate, tuple) else mv_rate
+        raise LawError(f"mv_rate is {shown}; give the largest MV change a sample, above 0, or leave it out")
+    both = [(inf if r is None else r, s.max_move or inf) for r, s in zip(given, signals.mv, strict=True)]
+    # An on-off valve has no positions between, so no rate.
+    rates = tuple(inf if s.values else min(pair) for s, pair in zip(signals.mv, both, strict=True))
+    return None if all(map(isinf, rates)) and all(rate is None for rate in given) else rates
+
+
+def stood_still(mv_applied: Tensor, applied_before: Tensor, given: Tensor, near: Tensor) -> Tensor:
+    """Whether the actuator did not move although the law asked for a move, bool (..., 1).
+
+    ``mv_applied`` and ``applied_before`` [mv] are what the plant received over the last period and over the one
+    before it, ``given`` [mv] what the law asked for over the last period, each (..., 1). Differences up to ``near``
+    [mv] count as none. An actuator that moves, but lags behind, does not stand still.
+    """
+    return ((mv_applied - given).abs() > near) & ((mv_applied - applied_before).abs() <= near)
+
+
+def never_given(sp_move: Tensor, error_before: Tensor) -> Tensor:
+    """The part of the last error that a move of the set point cancels, (..., 1), in the unit of the arguments.
+
+        clip(-(r - r1), 0 and e1),   e1 = r1 - y1
+
+    A set point that moves towards the process variable takes the proportional action of e1 out of the MV. An
+    actuator that stood still has never received that action, and to take it out is a kick. The law adds this
+    part to its set-point move in such a sample, and starts from the MV that the actuator holds. A move away from
+    the process variable, or beyond it, keeps its proportional action.
+
+    ``sp_move`` is r - r1, ``error_before`` e1, both (..., 1) and both with the same factor (a gain, a weight).
+    """
+    nothing = torch.zeros_like(error_before)
+    low, high = torch.minimum(error_before, nothing), torch.maximum(error_before, nothing)
+    return torch.minimum(torch.maximum(-sp_move, low), high)
+
+
+# --------------------- defaults that follow from the range of the controlled variable, so that its unit does not matter
+P = TypeVar("P")
+
+
+class OfRange(float):
+    """A default that counts in the set point's range: the parameter is ``share * range**power``.
+
+    A parameter that somebody states is a plain float, in the unit that its docstring names. Until ``in_units``
+    has turned it into that unit the default has the value of its share, above 0 as the parameter itself.
+    """
+
+    power: int
+
+    def __new__(cls, share: float, power: int = 1) -> Self:
+        """A share (-) of the range to a power."""
+        made = super().__new__(cls, share)
+        made.power = power
+        return made
+
+    def __getnewargs__(self) -> tuple[float, int]:  # type: ignore[override]  # float has one argument
+        return float(self), self.power
+
+    def __repr__(self) -> str:
+        words = {1: "* range", -1: "/ range"}
+        return f"{float(self):g} " + words.get(self.power, f"* range^{self.power}")
+
+    __str__ = __repr__
+
+    def over(self, span: float) -> float:
+        """The parameter for a range of width ``span`` [pv]."""
+        return float(self) * span**self.power
+
+
+def ascend(low: float, high: float) -> bool:
+    """Whether ``low < high``; True while only one of them is stated, as ``in_units`` has them compared again."""
+    return isinstance(low, OfRange) != isinstance(high, OfRange) or low < high
+
+
+def in_units(params: P, signals: Signals, law: str) -> P:
+    """The parameters of a law with every default of the type ``OfRange`` in the unit of the controlled variable.
+
+    Raises LawError where a stated parameter does not fit a default, such as a lower bound above the upper one.
+    """
+    span = signals.sp[0].high - signals.sp[0].low
+    values = {field.name: getattr(params, field.name) for field in fields(params)}  # type: ignore[arg-type]
+    scaled = {name: _over(value, span) for name, value in values.items()}
+    changed = {name: value for name, value in scaled.items() if value is not values[name]}
+    if not changed:
+        return params
+    try:
+        return replace(params, **changed)  # type: ignore[type-var]
+    except ValueError as error:
+        raise LawError(f"law {law!r}: {error}") from error
+
+
+def _over(value: Any, span: float) -> Any:
+    if isinstance(value, OfRange):
+        return value.over(span)
+    if isinstance(value, tuple) and any(isinstance(v, OfRange) for v in value):
+        return tuple(_over(v, span) for v in value)
+    return value

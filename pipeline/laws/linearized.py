@@ -12,8 +12,16 @@ from torch import Tensor
 
 from loopwright.pipeline.errors import LawError, ModelError
 from loopwright.pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, move, signed_unit, target, target_slots
-from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
-from loopwright.pipeline.laws.scaled_defaults import OfRange, ascend, in_units
+from loopwright.pipeline.laws.base import (
+    ControlLaw,
+    OfRange,
+    Stepped,
+    ascend,
+    hold_numbers,
+    in_units,
+    require_kind,
+    require_single_loop,
+)
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.lagged.instantaneous import Ahead, Arx, GaussNewton, NextOutput, arx
 from loopwright.pipeline.models.lagged.lagged import NNARX
@@ -281,7 +289,7 @@ class MinimumVariance(ControlLaw):
     name: ClassVar[str] = "minimum_variance"
     title: ClassVar[str] = "Minimum variance by the NNARX, no PID"
     parts: ClassVar[Mapping[str, str]] = {"nnarx": "kind nnarx"}
-    incremental: ClassVar[bool] = True
+    velocity_form: ClassVar[bool] = True
     looks_ahead: ClassVar[int | None] = 1
 
     @dataclass(frozen=True, slots=True)

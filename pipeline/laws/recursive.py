@@ -11,9 +11,16 @@ from torch import Tensor
 
 from loopwright.pipeline.errors import LawError, ModelError
 from loopwright.pipeline.laws.adaptive import AdaptiveParams, AdaptivePid, move, signed_unit, target
-from loopwright.pipeline.laws.base import ControlLaw, Stepped, hold_numbers, require_kind, require_single_loop
+from loopwright.pipeline.laws.base import (
+    ControlLaw,
+    OfRange,
+    Stepped,
+    hold_numbers,
+    in_units,
+    require_kind,
+    require_single_loop,
+)
 from loopwright.pipeline.laws.gain_update import PidForm
-from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.lagged.lagged import ARX
 from loopwright.pipeline.models.lagged.recursive_arx import RecursiveArx, RecursiveLeastSquares
@@ -148,7 +155,7 @@ class SelfTuningPid(ControlLaw):
     name: ClassVar[str] = "self_tuning_pid"
     title: ClassVar[str] = "Self-tuning PID"
     parts: ClassVar[Mapping[str, str]] = {"arx": "kind arx"}
-    incremental: ClassVar[bool] = True
+    velocity_form: ClassVar[bool] = True
     looks_ahead: ClassVar[int | None] = 1
 
     @dataclass(frozen=True, slots=True, kw_only=True)

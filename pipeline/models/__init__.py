@@ -9,16 +9,16 @@ import numpy as np
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart
+from loopwright.pipeline.models.hybrid_fuzzy_part import HybridFuzzyPart
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.lagged.lagged import ArxPart
 from loopwright.pipeline.models.lagged.nnarx_part import NnarxPart
-from loopwright.pipeline.models.local.local_models import LinearizedPart
-from loopwright.pipeline.models.local.local_models_part import LocalModelsPart
+from loopwright.pipeline.models.local_models import LinearizedPart
+from loopwright.pipeline.models.local_models_part import LocalModelsPart
 from loopwright.pipeline.models.part import Learnt, Part, Source
 from loopwright.pipeline.models.state_space import StateSpacePart
 from loopwright.pipeline.models.static.leverage_domain import DomainPart
-from loopwright.pipeline.models.static.rbf_part import RbfPart
+from loopwright.pipeline.models.static.sweep import RbfPart
 from loopwright.pipeline.models.training.network_parts import MlpPart
 
 MODELS: dict[str, type[Part]] = {

@@ -220,7 +220,7 @@ def run_sampled(
 
 
 # --------------------------------------------------------------------------- bounds of a case that is tested on models
-MODEL_BOUNDS_SCHEMA = 1
+MODEL_BOUNDS_SCHEMA = 1  # version of the file of kept bounds: another one is computed anew
 ANSWERS_A_HOLD = 3  # a hold lasts so many times as long as an answer of the plant; without a hold, the whole test
 
 

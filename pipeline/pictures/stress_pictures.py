@@ -8,7 +8,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
 from loopwright.pipeline.evaluation.stress.draws import STUCK, Draw
-from loopwright.pipeline.evaluation.stress.summary import Growth, Summary
+from loopwright.pipeline.evaluation.stress.summary import ErrorGrowth, Summary
 from loopwright.pipeline.pictures.drawing import STYLE, scale, signal_label, symbol, time_axis
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.simulate import Trajectory
@@ -68,7 +68,7 @@ def spread_canvas(summary: Summary, label: str) -> Canvas:
     return canvas
 
 
-def growth_canvas(growths: list[Growth]) -> Canvas | None:
+def growth_canvas(growths: list[ErrorGrowth]) -> Canvas | None:
     """The relative error along the drawn quantities that move it most; None where nothing was drawn."""
     shown = growths[:PANELS]
     if not shown:

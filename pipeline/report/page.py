@@ -19,10 +19,16 @@ from loopwright.pipeline.pictures.drawing import CasePicture
 from loopwright.pipeline.pictures.numbers import number, ratio
 from loopwright.pipeline.pictures.words import law_name, scenario_name
 from loopwright.pipeline.report.figures import draw_all, main_words
-from loopwright.pipeline.report.gone_wrong import dead_time_to_state, wrong_rows
 from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from loopwright.pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
-from loopwright.pipeline.report.own_acceptance import against, beyond_reach, shipped_laws, step_test_to_run
+from loopwright.pipeline.report.own_acceptance import (
+    against,
+    beyond_reach,
+    dead_time_to_state,
+    shipped_laws,
+    step_test_to_run,
+    wrong_rows,
+)
 from loopwright.pipeline.report.templating import REGISTRY_URL, render, write_pages
 from loopwright.pipeline.report.verdicts import BOUNDS, RULE, Judged, judge, validation
 from loopwright.pipeline.tuning.pid_forms import PidForms, whole_span

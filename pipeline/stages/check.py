@@ -33,7 +33,7 @@ from loopwright.pipeline.historian.cleaning.tags import check_tags
 from loopwright.pipeline.historian.export_params import check_agreement, check_period, signal_tags
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.laws.suitability import require_fit
-from loopwright.pipeline.models.local.local_models import LinearizedPart
+from loopwright.pipeline.models.local_models import LinearizedPart
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.models.training.network_parts import trainer_of
 from loopwright.pipeline.optimal.bounds import bounds_path, stored_bounds

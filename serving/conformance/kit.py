@@ -156,7 +156,7 @@ def _scan_row(row: Scanned) -> dict[str, Any]:
         "missed": scan.missed,
         "sample": None if scan.sample is None else _sample_row(scan.sample),
         "mode": str(command.mode),
-        "fault": bool(command.reason),
+        "fault": bool(command.fault),
         "mv": written(command.mv) if command.writes else None,
     }
 

@@ -20,7 +20,7 @@ BESIDE = ("", "-wal", "-shm")  # SQLite's files of one journal
 COPY = (*BESIDE, "-journal")  # of a copy that is being made
 
 
-class Harm(Enum):
+class FileChange(Enum):
     """A change of a file that is open."""
 
     GONE = "was deleted"
@@ -43,7 +43,7 @@ class OpenFiles:
         self._known: dict[str, Identity] = {}
         self.harm()
 
-    def harm(self, rows: int = 0) -> Harm | None:
+    def harm(self, rows: int = 0) -> FileChange | None:
         """Their changes since; None without any. OSError where nobody can tell.
 
         ``rows`` is how many scans and events the journal holds.
@@ -52,12 +52,12 @@ class OpenFiles:
             now, found = self._identity(end)
             before = self._known.setdefault(end, now) or now
             if now != before:
-                return Harm.GONE if now is None else Harm.REPLACED
+                return FileChange.GONE if now is None else FileChange.REPLACED
             self._known[end] = now
             if not end and found is not None:
                 before_size, self._size, self.mode = self._size, found.st_size, stat.S_IMODE(found.st_mode)
                 if self._size < before_size and not self._whole(rows):
-                    return Harm.CUT
+                    return FileChange.CUT
         return None
 
     def own(self, end: str) -> bool:
@@ -150,7 +150,7 @@ def cleared(files: OpenFiles, *, keep: bool) -> Path | None:
     return aside
 
 
-def made_again(harm: Harm, lost: int, *, empty: bool, aside: Path | None, unsteady: bool) -> str:
+def made_again(harm: FileChange, lost: int, *, empty: bool, aside: Path | None, unsteady: bool) -> str:
     """The fate of a journal, in a sentence. ``unsteady``: the numbers of its files are believed no more."""
     loss = f"{lost} scans and events are lost"
     end = f"it is made again with the rows that are left; {loss}" if lost else "it is made again with all its rows"

@@ -13,7 +13,7 @@ Numbered: TypeAlias = tuple[int, Item]
 DROPPED = ("scan", "event")  # in this order; a run stays, since scans need it, and so does what was learnt
 
 
-class Waiting:
+class EntryQueue:
     """Beyond ``most`` the oldest are dropped, scans before events; ``lost`` counts them.
 
     An entry that is taken counts until it is given back or written: a writer that hangs makes nothing grow.

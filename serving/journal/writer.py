@@ -21,8 +21,8 @@ import numpy as np
 from loopwright.serving.errors import LoopError
 from loopwright.serving.journal.entries import EventEntry, ScanEntry, columns, packed
 from loopwright.serving.journal.file import held, holds, is_damage, opened, sole_writer
-from loopwright.serving.journal.recovery import Harm, OpenFiles, alarm, cleared, copied, made_again
-from loopwright.serving.journal.waiting import Item, Waiting
+from loopwright.serving.journal.recovery import FileChange, OpenFiles, alarm, cleared, copied, made_again
+from loopwright.serving.journal.waiting import EntryQueue, Item
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.words import named
 
@@ -116,7 +116,7 @@ class Journal:
         self.trouble = ""
         self._fsync = fsync
         self._most_events = self._events = most_events(self.max_bytes)  # written since the last look at how many
-        self._queue, self._taken = Waiting(), list[Item]()
+        self._queue, self._taken = EntryQueue(), list[Item]()
         self._writing_s: float | None = None  # since when, on a monotonic clock
         self._base = opened(path, write=True, fsync=fsync)
         try:
@@ -125,7 +125,7 @@ class Journal:
             self._base.close()
             raise
         self._files = OpenFiles(path.resolve())
-        self._harm: Harm | None = None  # which has yet to be mended
+        self._harm: FileChange | None = None  # which has yet to be mended
         self._making, self._made_s = False, -math.inf  # whether the file is being made again; when it last was
         self._replaced = 0  # how many times in a row right after it was made
         self._run_id, self._run_row = 0, None  # the run of the scans that come
@@ -220,7 +220,7 @@ class Journal:
                     self.tell(f"the journal cannot be written: {named(error)}")
                 self.trouble = named(error)
                 damaged = self._harm is None and is_damage(error)
-                self._harm = Harm.DAMAGED if damaged else self._harm
+                self._harm = FileChange.DAMAGED if damaged else self._harm
                 if self._closing.is_set() and not damaged:
                     self._give_up()
                     return
@@ -302,14 +302,14 @@ class Journal:
             finally:
                 self._making = False
 
-    def _make_again(self, harm: Harm) -> None:
+    def _make_again(self, harm: FileChange) -> None:
         """A new file with all rows of the open one; an empty one where that cannot be read any more.
 
         Where the disk takes no copy now, the error is raised: the open file has the rows still.
         """
         path, old = self._files.path, self._base
-        copy = None if harm is Harm.DAMAGED else copied(old, path)
-        again = harm is Harm.REPLACED and time.monotonic() - self._made_s < 2 * AGAIN_S
+        copy = None if harm is FileChange.DAMAGED else copied(old, path)
+        again = harm is FileChange.REPLACED and time.monotonic() - self._made_s < 2 * AGAIN_S
         self._replaced = self._replaced + 1 if again else 0
         unsteady = self._files.steady and self._replaced >= UNSTEADY
         self._files.steady = self._files.steady and not unsteady

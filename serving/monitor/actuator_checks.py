@@ -21,7 +21,7 @@ MEMORY = 100  # scans over which turns and moves are averaged: of 40 noisy ones 
 TURNING_SHARE, TURNING_MOVE = 0.8, 0.05  # share of moves that turn round; mean move, of the range
 
 
-class Plight:
+class ActuatorFaults:
     """MVs that stay at an end of their range beside a large error, and MVs that turn round at nearly every scan.
 
     Parameters

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.monitor.cusum import ANY, COUNT, WEEK_S, Chart, Kept, Remembers
+from loopwright.serving.monitor.cusum import ANY, COUNT, WEEK_S, Chart, KeepsState, Kept
 from loopwright.serving.monitor.loop_statistics import estimated, ranges
 from loopwright.serving.monitor.plant_drift import Answers
 
@@ -25,7 +25,7 @@ LEAST_SHIFT = 0.002  # of a range: less is not worth a word
 FOREVER = 10**9  # scans: a block ends with its batch alone
 
 
-class BatchMeans(Remembers):
+class BatchMeans(KeepsState):
     """Means over eighths of each batch: every MV, every PV, what the law estimates; and ``Answers`` of a batch.
 
     A batch is a stretch in AUTO that the operator, or the recipe, ends with MANUAL or SHADOW. The first one gives

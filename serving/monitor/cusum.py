@@ -25,7 +25,7 @@ TIME_S: Range = (0.0, 1e11)  # since 1970: to the year 5138
 LONGEST_LIST = 1_000  # entries of a list that is kept
 
 
-class Remembers:
+class KeepsState:
     """Keeps the attributes in ``KEPT``, each with the range of its numbers.
 
     An attribute is a number, a bool, a list of numbers, an array, or another that remembers; of the last the range
@@ -56,13 +56,13 @@ def number(kept: Any, name: str, within: Range) -> float:
 
 
 def _out(value: Any) -> Any:
-    if isinstance(value, Remembers):
+    if isinstance(value, KeepsState):
         return value.memory()
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _in(present: Any, kept: Any, name: str, within: Range) -> Any:
-    if isinstance(present, Remembers):
+    if isinstance(present, KeepsState):
         present.recall(kept)
         return present
     if isinstance(present, np.ndarray):
@@ -152,7 +152,7 @@ FEWEST_FREEDOMS = 3.0  # degrees of freedom that a scatter is believed to have a
 LEARNING_WORTH, LEARNING_DOUBLINGS = 12.0, 2
 
 
-class Chart(Remembers):
+class Chart(KeepsState):
     """Page's cumulative sums, upwards and downwards, for each of n figures x(j).
 
         up(j) = max(0, up(j-1) + z(j) - k),    down(j) = max(0, down(j-1) - z(j) - k),    z = (x - mean) / scatter

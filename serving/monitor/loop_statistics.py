@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.manifest import Manifest, Signal
-from loopwright.serving.monitor.cusum import ANY, COUNT, SIGN, SIZE_RANGE, Chart, Kept, Remembers
+from loopwright.serving.monitor.cusum import ANY, COUNT, SIGN, SIZE_RANGE, Chart, KeepsState, Kept
 
 # ------------------------------------------------------------- mean squares of errors over blocks, by their logarithms
 Array: TypeAlias = NDArray[np.float64]
@@ -37,7 +37,7 @@ SQUARES = 1000  # scans over which squares of errors are averaged
 START_VARIANCE = 100.0  # variance of its numbers before it has learnt
 
 
-class BesideModel(Remembers):
+class OnlineArx(KeepsState):
     """y(k+1) = theta' phi(k), phi = [y(k), y(k-1), mv(k), ..., mv(k-4), 1], all of their ranges.
 
     By recursive least squares, until ``freeze``. y are all PVs.
@@ -114,7 +114,7 @@ def ranges(signals: Sequence[Signal]) -> tuple[Array, Array]:
 # ---------------------------------------------------------------------------------------- the errors of the law itself
 
 
-class Foresight(Remembers):
+class Foresight(KeepsState):
     """Errors of ``next_<PV>`` of a law's info for each controlled variable, in blocks of ``block`` scans.
 
     The logarithm of each block's mean square goes into a chart upwards. ``told``: whether the law tells it at all.
@@ -166,7 +166,7 @@ ORDER = 15  # of the error's autoregressive model
 LEAST_VARIANCE = 1e-12  # variance of the error up to which the index is 1: a larger one is divided by
 
 
-class Swing(Remembers):
+class Swing(KeepsState):
     """Zero crossings of an error, and how regular they are.
 
     Regularity r = mean / (3 standard deviation) of the last ``REGULAR_INTERVALS`` intervals between crossings; above 1
@@ -247,7 +247,7 @@ def harris_index(errors: Array, dead: int) -> float:
 
 
 # ----------------------------------------------------------------- shares of time: saturated, in HOLD, at a rate limit
-class Share(Remembers):
+class Share(KeepsState):
     """A share of the last ``memory`` scans, and what it was when ``learn`` scans had been seen.
 
     share(k) = share(k-1) + (x(k) - share(k-1)) / min(k, memory)
@@ -287,7 +287,7 @@ def estimated(info: tuple[str, ...]) -> list[int]:
     return [i for i, n in enumerate(info) if n.startswith("load_") or n.endswith("offset") or n == "disturbance"]
 
 
-class Estimates(Remembers):
+class Estimates(KeepsState):
     """The mean square of each estimate over blocks of ``block`` scans: its logarithm goes into a chart."""
 
     KEPT: ClassVar[Kept] = {"sums": SIZE_RANGE, "count": COUNT, "chart": ANY}

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from loopwright.serving.guard import Sample
 from loopwright.serving.loop import Command, Mode
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.monitor.actuator_checks import ACTUATOR_AT_END, Following, Plight
+from loopwright.serving.monitor.actuator_checks import ACTUATOR_AT_END, ActuatorFaults, Following
 from loopwright.serving.monitor.batches import BatchMeans
 from loopwright.serving.monitor.cusum import (
     DAY_S,
@@ -108,7 +108,7 @@ class Monitor:
         self.estimates = Estimates(m.info, block=block, learn=learn, weekly=weekly, rate=rate)
         self.batches = BatchMeans(m, rate)
         self.swings = [Swing(SWING_BAND * (s.high - s.low)) for s in m.sp]
-        self.plight = Plight(m.mv, 2 * self.settle)
+        self.actuators = ActuatorFaults(m.mv, 2 * self.settle)
         self.following = Following(m.mv, self.settle)
         self._commanded: Array | None = None  # at the scan before, where it was written
         self.harris = [Share(1, 20) for _ in m.sp]
@@ -162,7 +162,7 @@ class Monitor:
         for value, share, mean, swing in zip(errors, off, self.errors, self.swings, strict=True):
             mean.add(share)
             swing.add(value)
-        self.plight.add(mv, max(off), time_s)
+        self.actuators.add(mv, max(off), time_s)
         missed = self.foresight.add(pv, command.info, time_s)
         self.answers.add(pv, mv, missed, time_s)
         self.estimates.add(command.info, time_s)
@@ -176,7 +176,7 @@ class Monitor:
     def _follow(self, time_s: float, sample: Sample | None, command: Command) -> None:
         """Compare the read-back with the command before, in each mode that writes; a fault says nothing of it."""
         before, self._commanded = self._commanded, None
-        if sample is None or sample.mv_applied is None or command.reason or not command.writes:
+        if sample is None or sample.mv_applied is None or command.fault or not command.writes:
             self.following.forget()
             return
         self._commanded = command.mv
@@ -242,7 +242,7 @@ class Monitor:
         self.foresight.forget()
         self.answers.forget()
         self.batches.forget()
-        self.plight.forget()
+        self.actuators.forget()
         self._steady()
         self._sp = self._last = None
         self._still = 0

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.manifest import Manifest, Signal
-from loopwright.serving.monitor.cusum import ANY, COUNT, SIZE_RANGE, Chart, Kept, Remembers
-from loopwright.serving.monitor.loop_statistics import LEAST_SIGMA, SQUARES, BesideModel, log_mean_square, rms_ratio
+from loopwright.serving.monitor.cusum import ANY, COUNT, SIZE_RANGE, Chart, KeepsState, Kept
+from loopwright.serving.monitor.loop_statistics import LEAST_SIGMA, SQUARES, OnlineArx, log_mean_square, rms_ratio
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ FORGET = 0.95  # a move
 WILD = 0.25  # of the learning time in which the map is still too wild for its scatter to be known
 
 
-class RestMap(Remembers):
+class RestMap(KeepsState):
     """mv_rest = theta' phi(sp), phi piecewise linear over each set point's range, by recursive least squares.
 
     It learns ``learn`` periods of rest and is frozen then, but where it has no data (leverage phi' P phi >=
@@ -118,7 +118,7 @@ class RestMap(Remembers):
 LEAST_SCORE = 1.0  # of a score: what white errors give
 
 
-class Answers(Remembers):
+class Answers(KeepsState):
     """Errors e of a one-step model that is learnt beside the law, and of the law's own, over blocks of N scans.
 
     The model learns ``model`` blocks and is then frozen. Each further block gives, for each error,
@@ -147,7 +147,7 @@ class Answers(Remembers):
         self, manifest: Manifest, *, block: int, model: int, learn: int, weekly: float, rate: float, told: bool = False
     ) -> None:
         self.block, self.model_blocks = block, model
-        self.model = BesideModel(manifest)
+        self.model = OnlineArx(manifest)
         self.n_told = len(manifest.sp) if told else 0
         n_y, n_phi = self.model.n_y + self.n_told, self.model.n_phi
         self.told_square = np.zeros(self.n_told)  # mean square of the law's errors while the model learnt

@@ -70,7 +70,7 @@ def unit_of(s: Signal) -> str:
 
 
 # ------------------------------------------------------------------------------------------ the meaning of the figures
-MOST_HOLD = 0.02
+MOST_HOLD = 0.02  # share of the time in HOLD: above it somebody should look
 TOLD_AT_LIMITS, TOLD_OUTSIDE = 0.2, 0.1  # of the time: at limits, and outside the domain, from which on it is told
 SWING_REGULARITY = 1.0  # regularity of the error's crossings above which it is a swing, if large enough too
 WORSE_ERROR = 2.0  # times the validation's worst mean error: how often set points move is another matter here
@@ -82,26 +82,26 @@ RETRAIN_RATIO, RETRAIN_LEARNT = 1.5, 2.5  # of a law's own prediction; of a line
 
 def verdicts(m: Monitor) -> list[Verdict]:
     """All of them; whoever asks is to be ready for any error, for what was learnt came from a file."""
-    parts = (_plight, _following, _residual, _answers, _estimates, _batches, _rest, _variability, _swing, _shares)
+    parts = (_actuators, _following, _residual, _answers, _estimates, _batches, _rest, _variability, _swing, _shares)
     found = [verdict for part in parts for verdict in part(m)]
     if m.trouble:
         found.append(failed(m.trouble))
     return found
 
 
-def _plight(m: Monitor) -> list[Verdict]:
+def _actuators(m: Monitor) -> list[Verdict]:
     found = []
     for i, s in enumerate(m.manifest.mv):
-        name, plight = f"{s.name} moves", m.plight
-        if plight.jammed(i):
-            end = "upper" if plight.end[i] > 0 else "lower"
-            since = when(float(plight.since_s[i]))
+        name, actuators = f"{s.name} moves", m.actuators
+        if actuators.jammed(i):
+            end = "upper" if actuators.end[i] > 0 else "lower"
+            since = when(float(actuators.since_s[i]))
             text = f"{s.name} is at the {end} end of its range since {since}, and the error stays"
-            found.append(Verdict(name, "watch", text, float(plight.stuck[i]), float(plight.patience)))
-        elif plight.flutters(i):
-            size = f"{plight.move[i] * (s.high - s.low):.3g} {unit_of(s)}".strip()
+            found.append(Verdict(name, "watch", text, float(actuators.stuck[i]), float(actuators.patience)))
+        elif actuators.flutters(i):
+            size = f"{actuators.move[i] * (s.high - s.low):.3g} {unit_of(s)}".strip()
             text = f"{s.name} turns round at nearly every scan, by {size} each time"
-            found.append(Verdict(name, "watch", text, float(plight.turns[i])))
+            found.append(Verdict(name, "watch", text, float(actuators.turns[i])))
         else:
             found.append(Verdict(name, "as validated", "neither stuck at an end nor to and fro at each scan"))
     return found

@@ -5,26 +5,24 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import TypeAlias
 
 import numpy as np
-from asyncua import ua
 from numpy.typing import NDArray
 
 from loopwright.serving.errors import EndpointError, LoopError
 from loopwright.serving.guard import Sample
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.opcua.heartbeat import Heartbeat
 from loopwright.serving.opcua.link import Link
+from loopwright.serving.opcua.mv_sender import HAND_BACK, Heartbeat, MvSender
 from loopwright.serving.opcua.nameplates import Identity, Nameplates, identity, whole
-from loopwright.serving.opcua.node_lease import LeaseRefusedError, NodeLease
+from loopwright.serving.opcua.node_lease import NodeLease
 from loopwright.serving.opcua.plan import NodePlan
 from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.opcua.values import STATUS_GOOD, LateError, NodeReading, words
+from loopwright.serving.opcua.values import LateError
 from loopwright.serving.words import first_line, named
 
 __all__ = ["OpcUaEndpoint", "Values"]
@@ -39,9 +37,6 @@ ANSWER_PART, LONGEST_OPC_ANSWER_S = 0.8, 5.0  # of a period: so long an answer m
 SILENT_SCANS = 3  # without any answer: the connection is broken off and made anew
 # Pause [s] before a new connection: first, longest, times the last one.
 FIRST_RETRY_S, LAST_RETRY_S, RETRY_GROWTH = 0.2, 10.0, 1.6
-
-
-_HAND_BACK = "hand back"
 
 
 class OpcUaEndpoint:
@@ -101,23 +96,15 @@ class OpcUaEndpoint:
         self.trouble = "not connected yet"  # why there are no values; empty while there are
         self._read_failure = ""  # why the last reading failed at once, or the connection did; late ones grow old
         self._given: Values | None = None  # at the last scan
-        self.unwritten = ""  # why the last MV did not reach the plant
-        self._barred = ""  # why this connection takes none
         self._told_lost = ""  # what was said of the connection since it was lost
         self.connected = False  # as it was told last
         self.connections = self.starts = 0
         self._started_s: float | None = None  # when the server started, by its own clock
-        self._outbox = deque[Array | str]()  # MVs that wait, or _HAND_BACK
-        self._scans, self._next_s, self._wrote = 0, 0.0, 0
-        self._written: tuple[Array, float] | None = None  # the last MV that was passed on, and when
-        self._called = self._asked = 0  # the scans of the last calls to write and to hand_back
-        # Which connection has shown where the plant is (0: the present one has not, since a write failed if one did),
-        # and which one `read` told of.
-        self._shown_on, self._told_on = 0, 0
-        self.lease = NodeLease(self.period_s)
+        self._next_s = 0.0
+        names, rewrite_s = [s.name for s in manifest.mv], server.rewrite_s / speed
+        self.sender = MvSender(names, rewrite_s, self.answer_s, NodeLease(self.period_s), clock)
         self.nameplates, self._identified = Nameplates(nodes, manifest, spaces), identified
         self._heartbeat, self._sampling = Heartbeat(), NodeSampling(manifest, server, nodes, self.nameplates)
-        self._handed_back = False
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._closed = threading.Event()
@@ -143,10 +130,10 @@ class OpcUaEndpoint:
 
     def read(self) -> Sample:
         """The last values; EndpointError where there are none that are young enough."""
-        self._told_on = self._shown_on
+        self.sender.told_on = self.sender.shown_on
         values = self.values  # before the time is taken: newer ones may arrive meanwhile, from the future as it were
         now = self.clock()
-        self._scans += 1
+        self.sender.scans += 1
         self._next_s = now + self.period_s - self.lead_s
         self._stir()
         if values is None:
@@ -159,7 +146,7 @@ class OpcUaEndpoint:
             raise EndpointError(self.trouble)
         # An MV of long ago, or from before a write that failed, is none that the plant has now; an old PV may come with
         # a young MV.
-        mv = values.mv if self._told_on and now - values.arrived_s <= self.max_age_s else None
+        mv = values.mv if self.sender.told_on and now - values.arrived_s <= self.max_age_s else None
         late = self._late(values, now)
         return Sample(values.pv, mv, values.dv, age * self.speed, values.fault, values.quality, late)
 
@@ -174,47 +161,28 @@ class OpcUaEndpoint:
         A connection that was made anew takes none before ``read`` has told where the MV stands, and so does one on
         which a write has failed. An MV that still waits for a slow answer is not lost: this one goes out in its place.
         """
-        now, before, self._called = self._scans, self._called, self._scans
-        if now - before > 1:
-            self.unwritten = ""  # of a time after which nothing was written: it says nothing of now
-        refused = self.unwritten or self.nameplates.unwritable or self._barred
-        if self._link is None or self._shown_on == 0 or self._told_on != self._shown_on:
+        sender = self.sender
+        mine = sender.called()
+        refused = sender.unwritten or self.nameplates.unwritable or sender.barred
+        if self._link is None or sender.unread:
             unread = "where the MV stands has not been read yet"
-            self._refuse(self.trouble or refused or ("not connected" if self._link is None else unread))
+            sender.refuse(self.trouble or refused or ("not connected" if self._link is None else unread))
         if refused:
-            self._refuse(refused)
-        if not self._stands(mv, now - before <= 1):
-            self._outbox.append(np.array(mv))
+            sender.refuse(refused)
+        if not sender.stands(mv, mine):
+            sender.outbox.append(np.array(mv))
             self._stir()
-
-    def _refuse(self, why: str) -> None:
-        """The loop holds the MV before this one, so neither this one may go out nor one that waits."""
-        self._outbox.clear()
-        self.unwritten, self._written = "", None
-        raise EndpointError(why)
-
-    def _stands(self, mv: Array, mine: bool) -> bool:
-        """Whether this very MV was passed on less than ``rewrite_s`` ago, and, as ``mine`` says, at each scan since."""
-        now, last = self.clock(), self._written
-        young = last is not None and now - last[1] < self.server.rewrite_s / self.speed
-        if mine and young and last is not None and np.array_equal(last[0], mv):
-            self._wrote = self._scans  # the lease is still needed
-            return True
-        self._written = np.array(mv), now
-        return False
 
     def hand_back(self) -> None:
         """Ask the plant's own controller to take the plant; EndpointError until the server has confirmed it."""
         if self.nodes.hand_back is None:
             raise LoopError("nodes.hand_back is not set: the loop knows no node by which to hand the plant back")
-        confirmed, before, self._asked = self._handed_back, self._asked, self._scans
-        self._handed_back = False
-        if confirmed and self._scans - before <= 1:  # an older answer is to a request of before the loop wrote again
+        if self.sender.ask_back():
             return
         if self._link is not None:
-            self._outbox.append(_HAND_BACK)
+            self.sender.outbox.append(HAND_BACK)
         self._stir()
-        raise EndpointError(self.unwritten or self.trouble or "asked for, not confirmed yet")
+        raise EndpointError(self.sender.unwritten or self.trouble or "asked for, not confirmed yet")
 
     # ------------------------------------------------------------------ the thread's side
     _link: Link | None = None
@@ -256,10 +224,7 @@ class OpcUaEndpoint:
                 found = await identity(link, self.nodes, self._started_s, patience_s)
                 spaces, seen = dict(self.nameplates.spaces), self.nameplates.seen(plan)  # also what is not told now
                 self._identified(found._replace(spaces=spaces, seen=seen))
-                if self._outbox:
-                    self._outbox.clear()  # what was to be written then is too old now
-                    self.unwritten = self.unwritten or "the connection was lost before the MV was sent"
-                self._written, self._shown_on, self._barred = None, 0, plan.unwritable
+                self.sender.begin(plan.unwritable)
                 self._link = link
                 pause = FIRST_RETRY_S
                 self._told_lost = ""
@@ -278,7 +243,7 @@ class OpcUaEndpoint:
                 if self._closed.is_set():
                     with suppress(Exception):
                         if plan is not None and plan.lease is not None:
-                            await self.lease.give_back(link, plan.lease, self.answer_s)
+                            await self.sender.lease.give_back(link, plan.lease, self.answer_s)
                     await link.close()
                 else:
                     link.abort()
@@ -334,15 +299,15 @@ class OpcUaEndpoint:
                 raise self.nameplates.moved
             now = self.clock()
             due = self._next_s if self._next_s > read_at else read_at + self.period_s
-            if self._outbox:
-                await self._send(link, plan)
+            if self.sender.outbox:
+                await self.sender.send(link, plan, self.nameplates)
             elif now >= due:
                 read_at = now
                 try:
-                    await self._heartbeat.beat(link, plan, self._scans, self.answer_s)
+                    await self._heartbeat.beat(link, plan, self.sender.scans, self.answer_s)
                     answers = await link.read(plan.asked, self.answer_s)
                     if plan.lease is not None:
-                        await self._lease(link, plan.lease, answers[-1])
+                        await self.sender.keep_lease(link, plan.lease, answers[-1])
                 except EndpointError as error:
                     silent += 1
                     self.trouble = first_line(error)
@@ -356,70 +321,9 @@ class OpcUaEndpoint:
                 self.values = self._sampling.valued(
                     plan, answers, ages, self.clock(), unbeaten=self._heartbeat.trouble, starts=self.starts
                 )
-                self.trouble, self._read_failure, self._shown_on = "", "", self.connections
+                self.trouble, self._read_failure, self.sender.shown_on = "", "", self.connections
             else:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(due - now):
                         await self._wake.wait()
                 self._wake.clear()
-
-    async def _send(self, link: Link, plan: NodePlan) -> None:
-        """Write what waits. A server that refuses is a fault; one that does not answer loses the connection."""
-        last: Array | str | None = None
-        with suppress(IndexError):  # the loop may take out what waits
-            while True:
-                last = self._outbox.popleft()
-        if last is None:
-            return
-        handing = isinstance(last, str)
-        barred = self.nameplates.unwritable or self._barred
-        if not handing and barred:  # it may be so since the MV was passed on
-            self._failed(barred)
-            return
-        try:
-            rows = [plan.hand_back()] if isinstance(last, str) else plan.variants(last)
-        except EndpointError as error:
-            self._failed(first_line(error))
-            if handing:
-                return
-            raise  # with the next connection all types are asked for anew
-        if plan.lease is not None:
-            try:
-                await self.lease.take(link, plan.lease, self.answer_s)
-            except EndpointError as error:
-                self._failed(first_line(error))
-                return
-        self._wrote = self._scans
-        try:
-            statuses = await link.write(rows, self.answer_s)
-        except EndpointError as error:
-            self._failed(first_line(error))
-            raise
-        names = ["hand_back"] if handing else [s.name for s in self.manifest.mv]
-        wrong = [f"{name}: {words(s)}" for name, s in zip(names, statuses, strict=True) if s >> 30 != STATUS_GOOD]
-        if wrong:
-            self._failed(f"the server refuses {', '.join(wrong)}")
-        else:
-            self.unwritten = ""
-        self._handed_back = handing and not wrong
-        if ua.StatusCodes.BadTypeMismatch in statuses:
-            # With the next connection all types are asked for anew.
-            raise EndpointError(f"{self.unwritten}: a node's type has changed")
-
-    def _failed(self, why: str) -> None:
-        """A write did not arrive: only a reading that is asked for from now on tells where the MV stands."""
-        self._shown_on = 0
-        self.unwritten = why
-
-    async def _lease(self, link: Link, node: ua.NodeId, answer: NodeReading) -> None:
-        """Keep the lease while MVs are written, and let it go when they are not: a shadow needs none."""
-        self.lease.seen(answer.words_held)
-        if not self.lease.held:
-            self._written = None  # also an MV that stands is sent then: only that takes the lease, or says who has it
-        elif self._scans - self._wrote > SILENT_SCANS:
-            await self.lease.give_back(link, node, self.answer_s)
-        else:
-            try:
-                await self.lease.renew(link, node, self.answer_s)
-            except LeaseRefusedError as error:
-                self.unwritten = self.unwritten or first_line(error)  # also while an MV stands and none is sent

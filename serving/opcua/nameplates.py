@@ -41,7 +41,7 @@ class Plate(NamedTuple):
     limits: str = UNKNOWN
 
 
-class Seen(NamedTuple):
+class KnownNode(NamedTuple):
     """A node as it was seen, by its id in loop.toml; UNKNOWN where its server did not tell."""
 
     node: str
@@ -61,7 +61,7 @@ class Identity(NamedTuple):
     spaces: Mapping[int, str]
     writes: Mapping[str, str]
     nodes: Mapping[str, str] = MappingProxyType({})
-    seen: Mapping[str, Seen] = MappingProxyType({})
+    seen: Mapping[str, KnownNode] = MappingProxyType({})
 
 
 class Nameplates:
@@ -135,12 +135,12 @@ class Nameplates:
         self.fault = next((why for (row, _), why in self._wrong.items() if row.measured), "")
         self.unwritable = next((why for (row, _), why in self._wrong.items() if row.written), "")
 
-    def seen(self, plan: NodePlan) -> dict[str, Seen]:
+    def seen(self, plan: NodePlan) -> dict[str, KnownNode]:
         """The nodes by row as they were when the loop began."""
         found = {}
         for row, _ in plan.measuring():
             kind, plate = self._kinds.get(row.name), self._plates.get(row.name, Plate())
-            found[row.name] = Seen(row.node, UNKNOWN if kind is None else kind.name, *plate)
+            found[row.name] = KnownNode(row.node, UNKNOWN if kind is None else kind.name, *plate)
         return found
 
     async def watch(self, link: Link, plan: NodePlan, timeout_s: float) -> None:
@@ -286,13 +286,13 @@ async def any_number(link: Link, nodes: Sequence[ua.NodeId], timeout_s: float) -
     return [(k.NamespaceIndex == 0 and k.Identifier in ANY) if isinstance(k, ua.NodeId) else None for k in kinds]
 
 
-def others_since(before: Mapping[str, Seen], now: Mapping[str, Seen]) -> list[str]:
+def others_since(before: Mapping[str, KnownNode], now: Mapping[str, KnownNode]) -> list[str]:
     """A line for each row whose node has another type, unit or range than before; one of another id is another node."""
     return [
         f"{row}: its {what} is {is_now} now and was {was} when the loop last ran"
         for row, seen in now.items()
         if row in before and before[row].node == seen.node
-        for what, was, is_now in zip(Seen._fields[1:], before[row][1:], seen[1:], strict=True)
+        for what, was, is_now in zip(KnownNode._fields[1:], before[row][1:], seen[1:], strict=True)
         if UNKNOWN not in {was, is_now} and was != is_now
     ]
 

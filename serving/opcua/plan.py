@@ -65,14 +65,14 @@ class Row:
         return self.point.node if self.written else self.point.read_back or self.point.node
 
     @property
-    def wish(self) -> bool:
+    def request(self) -> bool:
         """Whether the plant's own operator asks for something by it."""
         return self.role in {Role.SP, Role.MODE}
 
     @property
     def measured(self) -> bool:
         """Whether the loop computes with its number."""
-        return not (self.written or self.wish)
+        return not (self.written or self.request)
 
     @property
     def ages(self) -> bool:

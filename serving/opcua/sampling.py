@@ -107,7 +107,7 @@ class Values:
     asked_mode: str = ""
     ages: Mapping[str, float] = field(default_factory=dict)  # [s] of each measured value, by name
     starts: int = 0  # how often the server has started anew since the endpoint did
-    unheard: Mapping[str, str] = field(default_factory=dict)  # why a set point or the mode is no wish, by name
+    unheard: Mapping[str, str] = field(default_factory=dict)  # why a set point or the mode is no request, by name
 
 
 class NodeSampling:
@@ -140,14 +140,14 @@ class NodeSampling:
             # is a read-back, which says where the MV stands also while a PV is bad.
             told = usable or row.ages
             found[name] = point.scale * answer.number + point.offset if told else np.nan
-            if usable and not answer.text and (row.judged or row.wish):
+            if usable and not answer.text and (row.judged or row.request):
                 changed = self.nameplates.typed(row, answer.kind)
-                changed = changed or (self.nameplates.wrong.get(name, "") if row.wish else "")
-                if changed:  # another number: no PV to be shown, no place of the MV, no wish
+                changed = changed or (self.nameplates.wrong.get(name, "") if row.request else "")
+                if changed:  # another number: no PV to be shown, no place of the MV, no request
                     found[name] = np.nan
-                    if row.wish:
+                    if row.request:
                         unheard[name] = changed
-                    typed = typed or ("" if row.wish else changed)
+                    typed = typed or ("" if row.request else changed)
             if fault or not row.judged:
                 continue
             if answer.quality == STATUS_BAD or (

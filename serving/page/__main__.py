@@ -14,9 +14,9 @@ from typing import Any
 import uvicorn
 
 from loopwright.serving.errors import LoopError
+from loopwright.serving.page.access import TimedConnection
 from loopwright.serving.page.app import PageApp
-from loopwright.serving.page.patience import Impatient
-from loopwright.serving.page.settings import Page, listening
+from loopwright.serving.page.process import Page, listening
 from loopwright.serving.station.control import asked
 from loopwright.serving.words import first_line, named
 
@@ -42,7 +42,7 @@ def main() -> int:
     scheme = "http" if page.certificate is None else "https"
     config = uvicorn.Config(
         app.asgi(page.hosts(port), scheme),
-        http=Impatient,
+        http=TimedConnection,
         ws="none",
         log_config=None,
         access_log=False,

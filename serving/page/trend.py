@@ -19,7 +19,7 @@ MOST_CHANGES = 4  # of the mode for each point: two rows a point are drawn whole
 MODES = ("", "AUTO", "SHADOW", "MANUAL", "HOLD")  # the last is what an operator must not miss
 
 
-class Thinned:
+class BinnedExtremes:
     """The least and the greatest value of every column in each of ``points`` bins of a time, as they come in.
 
     A bin gives two rows at one time vector for all columns, in the order in which the two came in most columns' time;
@@ -127,7 +127,7 @@ def trend(reader: JournalReader, begin_s: float, end_s: float, points: int) -> d
     The mode is empty from the last scan before a gap to the first one after it. Times ascend: where the clock was set
     back, what came before and after it lies one over the other.
     """
-    thinned, whole, count = Thinned(begin_s, end_s, points), list[Piece](), 0
+    thinned, whole, count = BinnedExtremes(begin_s, end_s, points), list[Piece](), 0
     modes = Modes(begin_s, thinned.bin_s, points)
     runs: dict[int, dict[str, Any]] = {}
     longest = float(LINE_GAP)

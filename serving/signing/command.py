@@ -7,8 +7,8 @@ import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+from loopwright.serving.controller_file import contents
 from loopwright.serving.errors import SignatureError
-from loopwright.serving.signing.reading import contents
 from loopwright.serving.words import plain
 
 MAX_PASSWORD = 1023  # bytes, of cryptography

@@ -9,8 +9,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
+from loopwright.serving.controller_file import contents
 from loopwright.serving.errors import SignatureError
-from loopwright.serving.signing.reading import contents
 
 try:
     from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm

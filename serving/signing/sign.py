@@ -8,12 +8,11 @@ from datetime import UTC, datetime
 from os import PathLike
 from pathlib import Path
 
-from loopwright.serving.controller_file import difference, file_digest, manifest_in
+from loopwright.serving.controller_file import contents, difference, file_digest, manifest_in
 from loopwright.serving.errors import ArtifactError, SignatureError
 from loopwright.serving.graph import audit
 from loopwright.serving.signing import bundle
 from loopwright.serving.signing.keys import PrivateKey
-from loopwright.serving.signing.reading import contents
 from loopwright.serving.signing.statement import Statement, utc
 from loopwright.serving.signing.verify import MAX_SIDECAR, signature_of
 

@@ -9,12 +9,11 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from loopwright.serving.controller_file import file_digest
+from loopwright.serving.controller_file import contents, file_digest
 from loopwright.serving.errors import SignatureError
 from loopwright.serving.graph import audit
 from loopwright.serving.signing import bundle
 from loopwright.serving.signing.keys import PublicKey
-from loopwright.serving.signing.reading import contents
 from loopwright.serving.signing.statement import Statement
 
 SUFFIX = ".sig"

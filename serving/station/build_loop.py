@@ -23,9 +23,9 @@ from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.journal.file import LockTakenError, lock_of, locked, opened
 from loopwright.serving.loop import WARM_LEAD_S, ControlLoop, Mode
 from loopwright.serving.manifest import Signal
-from loopwright.serving.opcua.nameplates import Identity, Seen
+from loopwright.serving.opcua.nameplates import Identity, KnownNode
 from loopwright.serving.opcua.sampling import Values
-from loopwright.serving.page.settings import listening, require_usable
+from loopwright.serving.page.process import listening, require_usable
 from loopwright.serving.station.mv_lock import Lease, address_of
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.trust import require_accepted
@@ -199,20 +199,22 @@ def namespaces_before(journal: Path, endpoint: str) -> dict[int, str]:
     return {}
 
 
-def keep_nodes(journal: Journal, seen: Mapping[str, Seen]) -> None:
+def keep_nodes(journal: Journal, seen: Mapping[str, KnownNode]) -> None:
     """Write down as what the loop's nodes were seen, for its next run."""
     journal.keep(NODES, json.dumps(seen))
 
 
-def nodes_before(journal: Path) -> dict[str, Seen]:
+def nodes_before(journal: Path) -> dict[str, KnownNode]:
     """The nodes by row as the last run of the loop saw them; empty where a journal tells of none."""
     with suppress(LoopError, sqlite3.Error, ValueError, RecursionError), closing(JournalReader(journal)) as reader:
         kept = json.loads(reader.learnt(NODES) or "{}")
         if isinstance(kept, dict):
             whole = {
-                row: seen for row, seen in kept.items() if isinstance(seen, list) and len(seen) == len(Seen._fields)
+                row: seen
+                for row, seen in kept.items()
+                if isinstance(seen, list) and len(seen) == len(KnownNode._fields)
             }
-            return {row: Seen(*map(str, seen)) for row, seen in whole.items()}
+            return {row: KnownNode(*map(str, seen)) for row, seen in whole.items()}
     return {}
 
 

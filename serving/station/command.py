@@ -179,7 +179,7 @@ def _check(options: argparse.Namespace) -> int:
     controller = tried(settings.controller, settings.sha256 or None, settings.trusted)
     manifest = controller.manifest
     from loopwright.serving.opcua.inspection import Found, inspected
-    from loopwright.serving.opcua.nameplates import Seen, others_since
+    from loopwright.serving.opcua.nameplates import KnownNode, others_since
     from loopwright.serving.station.build_loop import namespaces_before, nodes_before, rehearsed, require_free
 
     here = rehearsed(settings, controller)
@@ -201,7 +201,7 @@ def _check(options: argparse.Namespace) -> int:
     wrong = [*here.wrong[said:], *(f"{row.signal}: {row.wrong}" for row in rows if row.wrong)]
     notes = [f"{row.signal}: {row.note}" for row in rows if row.note]
     notes += others_since(
-        nodes_before(settings.journal.file), {r.signal: Seen(r.node, r.kind, r.unit, r.limits) for r in rows}
+        nodes_before(settings.journal.file), {r.signal: KnownNode(r.node, r.kind, r.unit, r.limits) for r in rows}
     )
     for note in [*notes, *here.notes, *_unproven(manifest), *_warnings(settings), *ending(controller)]:
         print(plain(f"note: {note}"))
@@ -292,18 +292,18 @@ class _Lines:
 
     def show(self, sample: Sample | None, command: Command) -> None:
         """Tell the scan if it is one of those."""
-        now = (command.mode.value, tuple(command.sp.tolist()), command.reason)
+        now = (command.mode.value, tuple(command.sp.tolist()), command.fault)
         if now == self.last and command.scan % self.every:
             return
         self.last, m = now, self.manifest
-        self.known = self.known or not command.reason
+        self.known = self.known or not command.fault
         parts = [f"SP {s.name} {v:.5g}" for s, v in zip(m.sp, command.sp.tolist(), strict=True) if self.known]
         if sample is not None:
             parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in _known(m.pv, sample.pv)]
         parts += [f"{s.name} {v:.5g} {s.unit}" for s, v in _known(m.mv, command.mv)]
         if not command.writes and command.law_mv is not None:
             parts += [f"(law {s.name} {v:.5g})" for s, v in zip(m.mv, command.law_mv.tolist(), strict=True)]
-        self.tell(f"{command.mode:<6}  {'  '.join(parts)}  {command.reason}".rstrip())
+        self.tell(f"{command.mode:<6}  {'  '.join(parts)}  {command.fault}".rstrip())
 
 
 def _known(signals: Sequence[Signal], values: NDArray[np.float64]) -> list[tuple[Signal, float]]:

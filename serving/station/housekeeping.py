@@ -14,7 +14,7 @@ WAITING_LINES = 1_000  # lines
 LONGEST_END_S = 2.0  # that an end waits for lines to be read
 
 
-class Said:
+class LinePrinter:
     """Says lines by ``tell`` in a thread of its own, in their order; ``tell`` may block or raise as it likes.
 
     ``print`` blocks where a terminal is halted or a pipe is full, and raises where the disk behind it is. At most
@@ -35,7 +35,7 @@ class Said:
             return
         with self._lock:
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="said", daemon=True)
+                self._thread = threading.Thread(target=self._run, name="lines", daemon=True)
                 self._thread.start()
             try:
                 self._lines.put_nowait(line)
@@ -69,7 +69,7 @@ class Said:
 TENDING_EVERY_S = 60.0  # an alarm of another loop ends so long after that loop at most
 
 
-class Tending:
+class PeriodicTask:
     """Calls ``act`` now and then from a thread of its own; ``trouble`` is told what it raises, and "" once it is well.
 
     No word is said twice in a row.

@@ -39,7 +39,7 @@ def runtime_folder(folder: Path | None = None) -> Path:
 
 
 # ------------------------------------------------------------------------------------------------------------ the lock
-OPC_UA_PORT, DISCARD_PORT = 4840, 9
+OPC_UA_PORT, DISCARD_PORT = 4840, 9  # IANA: of a server whose address names none; of a socket that sends nothing
 
 
 class Lease:

@@ -78,12 +78,12 @@ class Recorder:
         """Write a scan down, and the fault or the new controller that came with it."""
         numbers = tuple(map(float, _numbers(self.controller.manifest, sample, command)))
         quality = () if sample is None else sample.quality
-        self.journal.scan(ScanEntry(time.time(), command.mode.value, numbers, quality, command.reason))
+        self.journal.scan(ScanEntry(time.time(), command.mode.value, numbers, quality, command.fault))
         # A reason whose numbers change, such as an age, is the same fault.
-        if command.reason != self._fault and kind_of(command.reason) != kind_of(self._fault):
-            before, self._fault = self._fault, command.reason
-            what = lasting(command.reason) or f"over: {lasting(before)}"
-            self.note("fault", "loop", what, alarm="fault", raised=bool(command.reason))
+        if command.fault != self._fault and kind_of(command.fault) != kind_of(self._fault):
+            before, self._fault = self._fault, command.fault
+            what = lasting(command.fault) or f"over: {lasting(before)}"
+            self.note("fault", "loop", what, alarm="fault", raised=bool(command.fault))
         self._changed(command)
         if loop.controller is not self.controller:
             self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")
@@ -94,7 +94,7 @@ class Recorder:
         """Say that the mode is another one though nobody asked for it: HOLD by a fault, and the way back."""
         if self._mode and command.mode.value != self._mode:
             words = f"mode {self._mode} -> {command.mode.value}"
-            self.note("change", "loop", words, lasting(command.reason), mode=command.mode)
+            self.note("change", "loop", words, lasting(command.fault), mode=command.mode)
         self._mode = command.mode.value
 
     def _tried(self, loop: ControlLoop) -> None:
@@ -136,7 +136,7 @@ ALARMING, ALARM = {"watch", "retrain"}, "monitor "
 VERDICT_LOOK_S, KEEP_S = 10.0, 600.0  # between two looks at the verdicts, and two writings of what was learnt
 
 
-class Watching:
+class MonitorRunner:
     """A monitor for each controller that comes to the plant; one that was here before goes on where it was."""
 
     def __init__(self, controller: Controller, recorder: Recorder) -> None:

@@ -21,11 +21,11 @@ from loopwright.serving.trust import require_accepted, signer
 MODE = "mode"
 
 
-class Wishes:
-    """A value that has changed is a wish.
+class NodeRequests:
+    """Requests of the plant's own operator by nodes: a value that has changed is one.
 
-    The set points that stand there when the loop begins are wishes, too; the mode is none. The values of a server that
-    has started anew are its defaults: nobody asked for them, and they are no wish until they change.
+    The set points that stand there when the loop begins are requests, too; the mode is none. The values of a server
+    that has started anew are its defaults: nobody asked for them, and they are no request until they change.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Wishes:
         self._unheard: Mapping[str, str] = {}
 
     def of(self, values: Values) -> tuple[dict[str, float], str]:
-        """Set points by name, and the mode, that are asked for with these values; empty where there is no wish."""
+        """Set points by name, and the mode, that are asked for with these values; empty where there is no request."""
         if values.starts != self.starts:
             self.starts = values.starts
             self._stands.clear()
@@ -43,12 +43,12 @@ class Wishes:
         return points, mode if mode and self._changed(MODE, mode, first=False) else ""
 
     def refused(self, values: Values) -> list[str]:
-        """Why a set point or the mode is no wish, in a line for each; each is told once while it lasts."""
+        """Why a set point or the mode is no request, in a line for each; each is told once while it lasts."""
         before, self._unheard = self._unheard, values.unheard
         return [why for name, why in values.unheard.items() if name not in before]
 
     def _changed(self, name: str, value: float | str, *, first: bool) -> bool:
-        """Whether a value is a wish; ``first``: also one that is seen for the first time."""
+        """Whether a value is a request; ``first``: also one that is seen for the first time."""
         before = self._stands.get(name)
         self._stands[name] = value
         return first if before is None else before != value

@@ -16,7 +16,7 @@ from loopwright.serving.guard import Allowed, Complete, Fresh, Frozen, Guard, In
 from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.modes import Fallback
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.page.settings import Page
+from loopwright.serving.page.process import Page
 from loopwright.serving.words import first_line, plain
 
 MAX_AGE = 1.5  # periods: one answer may be late, two may not
@@ -121,7 +121,7 @@ class Settings:
 
     ``trusted`` names public keys: only a controller that one of them signed is loaded, at the start and by a swap
     (None: any is). ``accept_unproven`` lets a controller into AUTO whose file does not prove it in closed loop, see
-    ``loopwright.serving.trust``. ``page`` is HOST:PORT or a table (see ``loopwright.serving.page.settings``); empty:
+    ``loopwright.serving.trust``. ``page`` is HOST:PORT or a table (see ``loopwright.serving.page.process``); empty:
     none.
     """
 

@@ -39,10 +39,10 @@ from loopwright.serving.station.build_loop import (
     usable,
 )
 from loopwright.serving.station.control import Answer, Control
-from loopwright.serving.station.housekeeping import Said, Tending
+from loopwright.serving.station.housekeeping import LinePrinter, PeriodicTask
 from loopwright.serving.station.mv_lock import Lease, Locks
-from loopwright.serving.station.recorder import Recorder, Watching
-from loopwright.serving.station.requests import Change, Request, Wishes, change, require_proven
+from loopwright.serving.station.recorder import MonitorRunner, Recorder
+from loopwright.serving.station.requests import Change, NodeRequests, Request, change, require_proven
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.station.views import Snapshot, about, picture, state
 from loopwright.serving.trust import Controller as TrustedController
@@ -80,8 +80,8 @@ class Station:
         tell: Callable[[str], None] = lambda _: None,
         controller: TrustedController | None = None,
     ) -> None:
-        self.settings, self.said = settings, Said(tell)
-        self.tell = tell = self.said.say
+        self.settings, self.printer = settings, LinePrinter(tell)
+        self.tell = tell = self.printer.say
         self.trusted = self._public_keys()
         self.certificates = expiries(settings.server)
         self.controller = controller or tried(settings.controller, settings.sha256 or None, self.trusted)
@@ -111,7 +111,7 @@ class Station:
         self.recorder = Recorder(self.journal, tell, settings.speed)
         self.recorder.end_old_alarms()
         self.locks = Locks(self.lease, self.recorder)
-        self.watching = Watching(self.controller, self.recorder)
+        self.watching = MonitorRunner(self.controller, self.recorder)
         self.changes = queue.SimpleQueue[Change]()
         self.loop: ControlLoop | None = None
         self.snapshot: Snapshot | None = None  # of the last scan; all that other threads read of it
@@ -122,7 +122,7 @@ class Station:
         self.ended = False
         self.page: PageProcess | None = None
         self._watchers: list[Callable[[Sample | None, Command], None]] = []
-        self.wishes = Wishes()
+        self.node_requests = NodeRequests()
         self._seen_before = nodes_before(settings.journal.file)
 
     @property
@@ -131,13 +131,13 @@ class Station:
         return self.controller.manifest
 
     @property
-    def in_charge(self) -> Controller:
+    def active_controller(self) -> Controller:
         """The controller in charge after the last scan."""
         return self.controller if self.snapshot is None else self.snapshot.controller
 
     def ending(self) -> list[str]:
         """A line for what the loop runs by and that ends soon: its controller's signature, its certificate."""
-        lines = ending(self.in_charge)
+        lines = ending(self.active_controller)
         return [*lines, *filter(None, (certificate.words() for certificate in self.certificates))]
 
     def ask(self, change: Change) -> None:
@@ -159,11 +159,11 @@ class Station:
         """Connect, and scan until ``end`` or for ``n`` scans."""
         s, m = self.settings, self.manifest
         with ExitStack() as stack:
-            for held in (self.said.end, self.lease.release, self.journal.close):
+            for held in (self.printer.end, self.lease.release, self.journal.close):
                 stack.callback(held)
             control = Control(s.journal.file, self.answer)
             stack.callback(control.close)
-            stack.callback(Tending(lambda: self._tend(control), self.locks.untended).close)
+            stack.callback(PeriodicTask(lambda: self._tend(control), self.locks.untended).close)
             self._serve(stack, control)
             stack.callback(self.watching.keep)
             stack.callback(self.endpoint.close)
@@ -254,12 +254,12 @@ class Station:
 
     def _plant_side(self, loop: ControlLoop, values: Values) -> None:
         """Set points and mode, where the plant's own operator changed them."""
-        starts = self.wishes.starts
-        changed, mode = self.wishes.of(values)
-        if self.wishes.starts != starts and (self.settings.nodes.sp or self.settings.nodes.mode is not None):
+        starts = self.node_requests.starts
+        changed, mode = self.node_requests.of(values)
+        if self.node_requests.starts != starts and (self.settings.nodes.sp or self.settings.nodes.mode is not None):
             what = "the plant's server has, or may have, started anew: the set points and the mode that stand there"
             self.recorder.note("connection", "opcua", f"{what} are no wish of its operator until they change")
-        for why in self.wishes.refused(values):
+        for why in self.node_requests.refused(values):
             self.recorder.note("change", "plant", f"refused: {why}")
         if changed:
             self._set_points(loop, changed)
@@ -293,7 +293,7 @@ class Station:
         """Write the scan down, and show it."""
         assert self.loop is not None
         self._moved(self.loop)
-        self.scans, self._faults = self.scans + 1, self._faults + bool(command.reason)
+        self.scans, self._faults = self.scans + 1, self._faults + bool(command.fault)
         seen, stepped = (sample, command, time.time()), self.recorder.controller
         if not np.isnan(command.mv).any():
             self._left_at = command.mv
@@ -327,7 +327,7 @@ class Station:
 
         Its first steps are another process's: a file that ends a process does not end this one.
         """
-        return tried(self.in_charge.path.parent / file, sha256, self.trusted)
+        return tried(self.active_controller.path.parent / file, sha256, self.trusted)
 
     def answer(self, tree: Any) -> Answer:
         """The answer to a request, from any thread: a view, or the change once a scan has carried it out."""
@@ -354,7 +354,7 @@ class Station:
 
     def _view(self, name: str) -> Answer:
         if name == "picture":
-            path = picture(self.in_charge)
+            path = picture(self.active_controller)
             return {"file": None if path is None else str(path.absolute())}
         return about(self) if name == "about" else state(self)
 

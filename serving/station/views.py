@@ -68,7 +68,7 @@ class Snapshot:
 
 def about(station: Station) -> View:
     """Description of the loop: its controller, its signals, the controllers that could take its place."""
-    controller = station.in_charge
+    controller = station.active_controller
     m = controller.manifest
     groups = {"sp": m.sp, "pv": m.pv, "mv": m.mv, "dv": m.dv}
     return {
@@ -110,7 +110,7 @@ def state(station: Station) -> View:
         "scan": command.scan,
         "alive": now - seen.seen_s <= patience,
         "mode": command.mode.value,
-        "reason": command.reason,
+        "reason": command.fault,
         "sp": _plain(command.sp),
         "pv": _plain(None if sample is None else sample.pv),
         "mv": _plain(command.mv if command.writes else None),

@@ -13,7 +13,7 @@ from loopwright.pipeline.cases.reversible_cstr.pictures import (
     reference_models_picture,
 )
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.pictures.free_runs import free_run_fit_at_least, free_run_picture, one_step_says_little
+from loopwright.pipeline.pictures.model_pictures import free_run_fit_at_least, free_run_picture, one_step_says_little
 
 
 def row(near: float, fit: float) -> dict[str, float]:

@@ -22,7 +22,7 @@ from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_models import (
 from loopwright.pipeline.cases.jacketed_batch_reactor.models import PrintedFuzzyPart, printed_model
 from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatchReactor
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import HybridFuzzyPart
+from loopwright.pipeline.models.hybrid_fuzzy_part import HybridFuzzyPart
 from loopwright.pipeline.models.part import Part, Source
 
 CHECKS = (one_step_errors, gaps, weak_cold_valve)

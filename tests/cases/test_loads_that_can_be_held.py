@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from own_cases import controllers_of_a_lag
 
-from loopwright.pipeline.cases.operating_range import SCALES, Reach, held_at
+from loopwright.pipeline.cases.operating_range import SCALES, OperatingRange, held_at
 from loopwright.pipeline.cases.own_plant import GATE
 from loopwright.pipeline.cases.own_tests import ABOVE_NOISE, LEAST_LOAD, TEST_LOAD, held_load, load_size, whole_load
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
@@ -24,7 +24,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def wanted_load(reach: Reach, monkeypatch: pytest.MonkeyPatch) -> float:
+def wanted_load(reach: OperatingRange, monkeypatch: pytest.MonkeyPatch) -> float:
     """The load before anything is asked of the MVs."""
     with monkeypatch.context() as patch:
         patch.setattr("loopwright.pipeline.cases.operating_range.can_command", lambda *_: True)

@@ -18,8 +18,7 @@ from loopwright.pipeline.errors import ParamsError, PlantError
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified import remembering
-from loopwright.pipeline.plants.perturbed import SpoiltPlant
-from loopwright.pipeline.plants.simulator import Signals
+from loopwright.pipeline.plants.simulator import PerturbedPlant, Signals
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.simulate import noise_draws, simulate_closed
 from loopwright.pipeline.tuning.responses import StepResponses
@@ -237,5 +236,5 @@ def test_loops_are_tuned_for_what_the_record_visited_and_not_for_a_transmitters_
     narrow = replace(plant.arrays, y_scale=plant.arrays.y_scale / 10)
     of = OwnPlant(plant.signals, narrow)
     assert of.asked == (pytest.approx([46.0]), pytest.approx([54.0]))
-    assert SpoiltPlant(of, {}).asked == of.asked
-    assert SpoiltPlant(of, {}).foreseen == of.foreseen == MOST_PERIODS
+    assert PerturbedPlant(of, {}).asked == of.asked
+    assert PerturbedPlant(of, {}).foreseen == of.foreseen == MOST_PERIODS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from loopwright.pipeline.cases.operating_range import Reach
+from loopwright.pipeline.cases.operating_range import OperatingRange
 from loopwright.pipeline.cases.own_model import OwnPlant
 from loopwright.pipeline.plants.identified import IdentifiedArrays
 from loopwright.pipeline.plants.simulator import Signals
@@ -16,14 +16,14 @@ PV, MV = Signal("y", "K", -3.0, 3.0), Signal("u", "%", -2.0, 2.0)
 SIGNALS = Signals(1.0, (PV,), (PV,), (), (MV,))
 
 
-def reach_of(a: float, b: float, held: float) -> Reach:
+def reach_of(a: float, b: float, held: float) -> OperatingRange:
     """y+ = a y + b u - held tanh(y), whose record visits outputs from -1.5 to 1.5."""
     rows = {"a": [[a]], "b": [[b]], "c": [0.0], "w1": [[1.0, 0.0]], "b1": [0.0], "w2": [[-held]]}
     scales = {"y_center": [0.0], "y_scale": [1.0], "v_center": [0.0], "v_scale": [1.0], "rest": [[1.0, 0.0, 0.0]]}
     arrays = IdentifiedArrays(**{name: np.array(values) for name, values in (rows | scales).items()})
     plant = OwnPlant(SIGNALS, arrays, mv=np.zeros(1), most_dead_time=1)
     record = Record.of(SIGNALS, np.linspace(-1.5, 1.5, 50)[:, None], np.linspace(-2.0, 2.0, 50)[:, None])
-    return Reach(plant, record)
+    return OperatingRange(plant, record)
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ from engine_pieces import folder_of
 from loopwright.pipeline.engine import pieces, start
 from loopwright.pipeline.engine.cluster import address, workers_here
 from loopwright.pipeline.engine.fingerprint import difference, fingerprint
-from loopwright.pipeline.engine.folder import NewFolder, apply, read_files
 from loopwright.pipeline.engine.parallel import as_done, parallel_map
 from loopwright.pipeline.engine.pieces import lost
+from loopwright.pipeline.engine.stage_files import NewFolder, apply, read_files
 from loopwright.pipeline.errors import PipelineError
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from processes import lives, within
 
-from loopwright.pipeline.engine.parent_death import hear_no_interrupt
+from loopwright.pipeline.engine.dvc import hear_no_interrupt
 
 ROOT = Path(__file__).parents[2]
 PROBE = """
@@ -32,7 +32,7 @@ FILES = (
     "__init__.py",
     "start.py",
     "with_cluster.py",
-    "parent_death.py",
+    "dvc.py",
     "output.py",
     "cluster.py",
     "stage_files.py",
@@ -50,7 +50,8 @@ def folder(tmp_path: Path) -> Path:
         room.mkdir(parents=True)
     for name in FILES:
         shutil.copy(ROOT / "pipeline" / "engine" / name, engine / name)
-    shutil.copy(ROOT / "pipeline" / "errors.py", root / "pipeline" / "errors.py")
+    for name in ("errors.py", "files.py"):
+        shutil.copy(ROOT / "pipeline" / name, root / "pipeline" / name)
     shutil.copy(ROOT / "serving" / "errors.py", root / "serving" / "errors.py")
     for room in (root / "pipeline", stages, root / "serving"):
         (room / "__init__.py").touch()

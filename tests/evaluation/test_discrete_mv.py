@@ -71,10 +71,10 @@ def test_a_loop_does_not_start_between_two_modes(file: Path) -> None:
 def test_a_valve_that_is_read_back_half_way_holds_the_loop(loop: ControlLoop) -> None:
     loop.set_mode(Mode.AUTO)
     good = loop.scan(Sample(PV, np.array([0.2, 1.0])))
-    assert (good.mode, good.reason) == (Mode.AUTO, "")
+    assert (good.mode, good.fault) == (Mode.AUTO, "")
     held = loop.scan(Sample(PV, np.array([0.2, 1.4])))
     assert held.mode is Mode.HOLD
-    assert held.reason == "applied MV mode is 1.4, none of 1, 2"
+    assert held.fault == "applied MV mode is 1.4, none of 1, 2"
     assert held.mv.tolist() == good.mv.tolist()
     assert [type(g).__name__ for g in default_guards(loop.controller.manifest)].count("Allowed") == 1
 

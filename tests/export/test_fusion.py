@@ -21,8 +21,8 @@ from shipped_files import SHIPPED
 from loopwright.pipeline.export import fusion
 from loopwright.pipeline.export.fusion import emission, fused, reading
 from loopwright.pipeline.export.fusion.affine import Affine
+from loopwright.pipeline.export.fusion.items import Group, SelectionPool
 from loopwright.pipeline.export.fusion.plan import FormChoice, Item
-from loopwright.pipeline.export.fusion.pools import Group, SelectionPool
 from loopwright.pipeline.export.fusion.reading import GraphReading
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"

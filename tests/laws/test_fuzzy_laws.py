@@ -19,7 +19,7 @@ from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.hybrid_fuzzy import HybridFuzzy
 
 CASE = CASES["jacketed_batch_reactor"]
 PLANT = CASE.plant

@@ -10,7 +10,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from quick_laws import QUICK, plant_of, quick_parts, rest_points
+from quick_laws import QUICK_PARAMS, plant_of, quick_parts, rest_points
 from shipped import required
 from torch import Tensor
 
@@ -166,7 +166,7 @@ def test_state_zero_is_no_past(law: ControlLaw) -> None:
     change = step(law, away).mv - step(law, inputs).mv
     if law.estimates:  # its MV may be at a limit with either
         assert not torch.equal(step(law, away).state, step(law, inputs).state)
-    elif law.incremental:
+    elif law.velocity_form:
         assert change.abs().max() > 0
     else:
         assert change.abs().max() == 0
@@ -174,7 +174,7 @@ def test_state_zero_is_no_past(law: ControlLaw) -> None:
 
 @pytest.mark.parametrize("which", range(3))
 def test_start_on_set_point_keeps_the_actuator(law: ControlLaw, law_plant: EquationPlant, which: int) -> None:
-    if not law.incremental:
+    if not law.velocity_form:
         pytest.skip("computes its MV afresh: on set point as accurate as its model")
     inputs = at_rest(law, law_plant, rest_points(law_plant)[which])
     state = None
@@ -186,7 +186,7 @@ def test_start_on_set_point_keeps_the_actuator(law: ControlLaw, law_plant: Equat
 
 def test_manual_to_auto_does_not_bump(law: ControlLaw, law_plant: EquationPlant) -> None:
     """In manual the law is stepped and not obeyed; what it does first in auto follows the error alone."""
-    if not law.incremental:
+    if not law.velocity_form:
         pytest.skip("computes its MV afresh: in auto it goes where its model says")
     rest = at_rest(law, law_plant, rest_points(law_plant)[1])
     rng = np.random.default_rng(5)
@@ -208,7 +208,7 @@ def test_a_stuck_actuator_that_comes_free_on_set_point_does_not_kick(
     Nothing is to be done, and a law without a past does nothing. What the law did with the error while it stood, the
     actuator has never received; to take it back is a kick. What remains is a `ramp` law's slope of the set point.
     """
-    if not law.incremental:
+    if not law.velocity_form:
         pytest.skip("computes its MV afresh: where its model says, whatever was applied")
     if isinstance(law, ReferenceLaw):
         pytest.skip("follows its reference on while its request is within 1 % of the applied MV")
@@ -237,7 +237,7 @@ def test_nan_never_becomes_a_number(law: ControlLaw, group: str) -> None:
 @pytest.mark.parametrize("name", sorted(LAWS))
 def test_the_parts_that_a_law_declares_are_enough_and_each_is_needed(name: str) -> None:
     cls, plant = LAWS[name], plant_of(name)
-    parts, given = quick_parts(plant.name), cls.Params(**QUICK[name])
+    parts, given = quick_parts(plant.name), cls.Params(**QUICK_PARAMS[name])
     if hasattr(given, "part"):
         given = dataclasses.replace(given, part=next(iter(parts)))
     declared = {part: parts[part] for part in cls.needs(given)}

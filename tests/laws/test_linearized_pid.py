@@ -15,10 +15,9 @@ from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.excitation import EXCITATIONS
 from loopwright.pipeline.export.fusion import fused
 from loopwright.pipeline.export.graph import law_graph
-from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.laws.base import ControlLaw, in_units
 from loopwright.pipeline.laws.gain_update import gain_update
 from loopwright.pipeline.laws.linearized import LinearizedPid
-from loopwright.pipeline.laws.scaled_defaults import in_units
 from loopwright.pipeline.models.lagged.instantaneous import linearize
 from loopwright.pipeline.models.lagged.lagged import NNARX
 

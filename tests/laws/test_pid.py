@@ -18,7 +18,7 @@ from loopwright.pipeline.cases.ph_neutralization.plant import PhNeutralization
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.models import Model
-from loopwright.pipeline.models.local.local_models import LinearizedPlant as LinearizedModel
+from loopwright.pipeline.models.local_models import LinearizedPlant as LinearizedModel
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.simulate import simulate_closed

@@ -7,7 +7,7 @@ import pytest
 from identified_models import first_order, made_signals
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.predictive.horizon_check import STEP_SAMPLES, Sight
+from loopwright.pipeline.laws.predictive.horizon_check import STEP_SAMPLES, AnswerTimes
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 
 
@@ -38,8 +38,8 @@ def test_a_horizon_that_ends_before_the_first_answer_is_refused() -> None:
 
 
 def test_the_first_answer_and_the_settling_are_those_of_the_model() -> None:
-    sight = Sight.of(first_order(0.9, dead=7), lambda z: z, 1)
+    sight = AnswerTimes.of(first_order(0.9, dead=7), lambda z: z, 1)
     assert sight.first == 8
     assert sight.settles == 7 + int(np.ceil(np.log(0.1) / np.log(0.9)))
     with pytest.raises(LawError, match=f"more than {STEP_SAMPLES} samples"):
-        Sight(STEP_SAMPLES + 1, 0).require(50)
+        AnswerTimes(STEP_SAMPLES + 1, 0).require(50)

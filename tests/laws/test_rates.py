@@ -14,7 +14,7 @@ from identified_models import made_signals, random_model
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.export.gate import export
-from loopwright.pipeline.laws.actuator import Rates, rates_of
+from loopwright.pipeline.laws.base import Rates, rates_of
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.plants.simulator import Signals

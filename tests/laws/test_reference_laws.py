@@ -17,7 +17,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.laws.reference.model_reference import ModelReference, ModelReferenceTwoError
 from loopwright.pipeline.laws.reference.pi_reference import PiReference
-from loopwright.pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
+from loopwright.pipeline.laws.reference.reference_law import Loops, PlantNetwork, Training
 from loopwright.pipeline.laws.reference.reference_networks import (
     IncrementalNetwork,
     Trainable,
@@ -171,7 +171,7 @@ def test_the_law_acts_as_what_was_trained(trained: dict[str, ControlLaw], name: 
 
 
 # ---------------------------------------------------------------- theory
-def test_no_weights_give_the_incremental_network_another_root(signals: Signals) -> None:
+def test_no_weights_give_the_network_in_velocity_form_another_root(signals: Signals) -> None:
     """At rest its move is zero for zero error alone, trained or not, even with weights far from any training."""
     rng = np.random.default_rng(7)
     for sign in (-1.0, 1.0):

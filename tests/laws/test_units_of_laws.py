@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from quick_laws import CALM, FORMS, QUICK, plant_of, quick_parts, rest_points
+from quick_laws import CALM, FORMS, QUICK_PARAMS, plant_of, quick_parts, rest_points
 
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
 from loopwright.pipeline.laws import LAWS, ControlLaw
-from loopwright.pipeline.laws.scaled_defaults import OfRange
+from loopwright.pipeline.laws.base import OfRange
 from loopwright.pipeline.models import Model
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.models.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.local_models import LocalModels
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.simulation.scenario import Scenario
@@ -100,7 +100,7 @@ def designed(name: str, **form: Any) -> ControlLaw:
 
 
 def quick(name: str) -> dict[str, Any]:
-    return {key: value for key, value in QUICK[name].items() if key not in CALM}
+    return {key: value for key, value in QUICK_PARAMS[name].items() if key not in CALM}
 
 
 def closed_loop(law: ControlLaw, levels: np.ndarray, pv_by: float, mv_by: np.ndarray, loop_test: Any) -> np.ndarray:

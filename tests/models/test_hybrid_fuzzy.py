@@ -18,8 +18,8 @@ from loopwright.pipeline.cases.jacketed_batch_reactor.plant import JacketedBatch
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models import MODELS, load_model
 from loopwright.pipeline.models.base import simulate
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import (
+from loopwright.pipeline.models.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.hybrid_fuzzy_part import (
     LEAST_VALVE_EFFECT,
     HybridFuzzyPart,
     Rules,

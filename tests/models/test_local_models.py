@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models import load_model
-from loopwright.pipeline.models.local.local_models import LocalModels, Validity, spacing
-from loopwright.pipeline.models.local.local_models_part import LocalModelsPart, free_run, operating_cv
+from loopwright.pipeline.models.local_models import LocalModels, Validity, spacing
+from loopwright.pipeline.models.local_models_part import LocalModelsPart, free_run, operating_cv
 from loopwright.pipeline.models.part import Source
 
 EXPECTED = [  # C, T, q_c solved exactly

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models import MODELS, load_model
-from loopwright.pipeline.models.local.local_models import LinearizedPlant
+from loopwright.pipeline.models.local_models import LinearizedPlant
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.plants.equations import EquationPlant
 

@@ -11,7 +11,7 @@ import torch
 from loopwright.pipeline.cases.ph_neutralization.identification_example import example_record
 from loopwright.pipeline.errors import ModelError, RecordError
 from loopwright.pipeline.models.lagged.lagged import NNARX
-from loopwright.pipeline.models.lagged.one_step import VARIANCE, OneStep, compare_one_step
+from loopwright.pipeline.models.lagged.nnarx_part import VARIANCE, OneStep, compare_one_step
 from loopwright.pipeline.models.training.regressors import nnarx_pairs
 from loopwright.pipeline.records.record import Record
 

@@ -11,8 +11,14 @@ import torch
 
 from loopwright.pipeline.cases import PLANTS
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.models.static.fuzzy_means import FuzzyMeansRBF, grid_points, select_centres, to_grid
-from loopwright.pipeline.models.static.least_squares import solve_iterative, solve_qr
+from loopwright.pipeline.models.static.fuzzy_means import (
+    FuzzyMeansRBF,
+    grid_points,
+    select_centres,
+    solve_iterative,
+    solve_qr,
+    to_grid,
+)
 from loopwright.pipeline.models.static.rbf import design_matrix
 from loopwright.pipeline.models.static.sweep import SweepResult, _cells, sweep
 from loopwright.pipeline.pictures.model_pictures import draw

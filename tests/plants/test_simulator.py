@@ -23,7 +23,7 @@ from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.metrics import mv_travel
 from loopwright.pipeline.models.lagged.lagged import ArxPart
-from loopwright.pipeline.models.local.local_models import LinearizedPart
+from loopwright.pipeline.models.local_models import LinearizedPart
 from loopwright.pipeline.models.part import Source
 from loopwright.pipeline.optimal.bounds import problem
 from loopwright.pipeline.plants.simulator import Simulator

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from chromium import CHROMIUM, launched
-from kits import DAMAGES, EMBED, SHIPPED, SOME, an_old_version, kit_of, name, spoilt, verdict_on
+from kits import DAMAGES, EMBED, PID, SOME, an_old_version, kit_of, name, spoilt, verdict_on
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
@@ -24,7 +24,6 @@ if not (EMBED / "browser" / "node_modules").is_dir():
 
 from playwright.sync_api import Page, expect
 
-PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
 expect.set_options(timeout=30_000)
 
 

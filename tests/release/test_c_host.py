@@ -6,27 +6,38 @@ tools/onnxruntime_c.sh makes the folder with its header and library; ONNXRUNTIME
 from __future__ import annotations
 
 import atexit
-import json
 import os
-import re
 import shutil
 import subprocess
 import sys
 import time
-from collections import Counter
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from tempfile import mkdtemp
 
 import pytest
-from kits import DAMAGES, EMBED, ROOT, SHIPPED, SOME, an_old_version, kit_of, name, spoilt, verdict_on
+from kits import (
+    DAMAGES,
+    EMBED,
+    PID,
+    ROOT,
+    SOME,
+    answers_refusals_and_disturbances,
+    fails_on_a_damaged_kit,
+    kit_of,
+    name,
+    refuses_an_old_kit,
+    refuses_in_one_line,
+    scans_of_a_loop,
+    verdict_on,
+    wrong_file,
+)
 
 CMAKE = shutil.which("cmake")
 if CMAKE is None or shutil.which("cc") is None:
     pytest.skip("cmake or a C compiler is missing (apt install cmake gcc)", allow_module_level=True)
 
 pytest_plugins = ["small_laws"]
-PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
 SANITIZERS = "-O1 -g -Werror -fsanitize=address,undefined -fno-sanitize-recover=all"
 
 
@@ -80,14 +91,7 @@ def test_c_gives_the_bits_of_our_runtime(host: Path, file: Path, tmp_path: Path)
 
 
 def test_c_refuses_results_and_takes_measured_disturbances(host: Path, disobedient_file: Path, tmp_path: Path) -> None:
-    """No shipped controller has measured disturbances or leaves its range; this one does both."""
-    vectors = json.loads((kit_of(disobedient_file) / "vectors.json").read_text())
-    refused = Counter(row.get("refused", "") for row in vectors["steps"])
-    assert min(refused["output"], refused["input"], refused[""]) >= 15
-    done = run(host, "--conformance", kit_of(disobedient_file), tmp_path / "answers.json")
-    assert done.returncode == 0, done.stdout + done.stderr
-    verdict = verdict_on(disobedient_file, tmp_path / "answers.json")
-    assert verdict.identical, verdict.text()
+    answers_refusals_and_disturbances(partial(run, host), disobedient_file, tmp_path / "answers.json")
 
 
 # By damage: the largest difference in one step and chained, and how many answers are wrong.
@@ -104,31 +108,17 @@ EXPECTED = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_c_does_not_pass_a_damaged_kit(host: Path, damage: str, tmp_path: Path) -> None:
-    done = run(host, "--conformance", spoilt(PID, tmp_path, DAMAGES[damage]))
-    assert done.returncode == 1, done.stdout + done.stderr
-    assert re.search(f"largest difference {EXPECTED[damage]} wrong", done.stdout), done.stdout
+    fails_on_a_damaged_kit(partial(run, host), damage, EXPECTED[damage], tmp_path)
 
 
 def test_c_refuses_an_old_kit(host: Path, tmp_path: Path) -> None:
-    done = run(host, "--conformance", spoilt(PID, tmp_path, an_old_version))
-    assert done.returncode == 2
-    assert done.stdout == ""
-    wanted = "the kit has the version 3, not 4: write it again with loopwright conformance FILE.onnx KIT"
-    assert done.stderr == f"error: {wanted}\n"
+    refuses_an_old_kit(partial(run, host), tmp_path)
 
 
 def test_the_c_loop_scans_once_a_period(host: Path) -> None:
     began = time.monotonic()
-    done = run(host, kit_of(PID) / "pid.onnx", "40", "0.02")
+    rows = scans_of_a_loop(partial(run, host))
     assert time.monotonic() - began >= 39 * 0.02
-    assert done.returncode == 0, done.stderr
-    rows = [line.split() for line in done.stdout.splitlines()]
-    places = [int(row[0]) for row in rows]
-    assert places == sorted(set(places))  # a busy machine leaves some out, also at the start
-    assert places[0] >= 0
-    assert len(places) > 1
-    assert all(float(row[1]) < 20 for row in rows)  # a later scan is one of the next period
-    assert {row[4] for row in rows} == {"AUTO"}
     assert all(0 <= float(row[5]) <= 500 for row in rows)
 
 
@@ -191,27 +181,7 @@ def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:
     ],
 )
 def test_a_file_that_is_not_right_is_one_line_of_the_c_host(host: Path, what: str, words: str, tmp_path: Path) -> None:
-    for suffix in (".onnx", ".json"):
-        shutil.copy(kit_of(PID) / f"pid{suffix}", tmp_path)
-    manifest, file = tmp_path / "pid.json", tmp_path / "pid.onnx"
-    text = manifest.read_text()
-    {
-        "cut": lambda: manifest.write_text(text[:700]),
-        "foreign": lambda: shutil.copy(next(f for f in SHIPPED if f.stem == "inc").with_suffix(".json"), manifest),
-        "changed": lambda: file.write_bytes(file.read_bytes() + b"x"),
-        "schema": lambda: manifest.write_text(text.replace('"schema": 1', '"schema": 2')),
-        "sizes": lambda: manifest.write_text(text.replace('"n_state": 7', '"n_state": 8')),
-        "range": lambda: manifest.write_text(text.replace('"high": 500.0', '"high": 5000.0')),
-        "unlimited": lambda: manifest.write_text(text.replace('"high": 500.0', '"high": 500.0, "max_move": 1')),
-        "without": lambda: manifest.write_text(text.replace('"pv": [', '"PV": [')),
-        "missing": manifest.unlink,
-    }[what]()
-    done = run(host, file, "1", "0.01")
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
-    assert words in done.stderr
+    refuses_in_one_line(partial(run, host), wrong_file(what, tmp_path), words)
 
 
 def test_the_c_host_says_how_it_is_called(host: Path) -> None:

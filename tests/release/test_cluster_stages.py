@@ -15,8 +15,7 @@ from own_cases import controllers_of_a_lag
 from processes import within
 
 from loopwright.pipeline.engine.cluster import ADDRESS, connected
-from loopwright.pipeline.engine.folder import read_files
-from loopwright.pipeline.engine.stage_files import DATA
+from loopwright.pipeline.engine.stage_files import DATA, read_files
 from loopwright.pipeline.files import write_json
 from loopwright.pipeline.stages.design import design
 from loopwright.pipeline.stages.excite import excite

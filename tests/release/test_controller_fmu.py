@@ -18,14 +18,15 @@ from loopwright.pipeline.cases import PLANTS
 from loopwright.pipeline.errors import HostError
 from loopwright.pipeline.hosts.fmu.folder import (
     build_description,
+    check,
     description,
     identifier_of,
     pack,
+    problems,
     token_of,
     variables_of,
     write_folder,
 )
-from loopwright.pipeline.hosts.fmu.gate import check, problems
 from loopwright.serving import Controller
 from loopwright.serving.conformance.steps import StepResult, answered
 

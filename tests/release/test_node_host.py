@@ -9,19 +9,31 @@ import json
 import re
 import shutil
 import subprocess
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import pytest
-from kits import DAMAGES, EMBED, SHIPPED, SOME, an_old_version, kit_of, name, spoilt, verdict_on
+from kits import (
+    DAMAGES,
+    EMBED,
+    PID,
+    SOME,
+    answers_refusals_and_disturbances,
+    fails_on_a_damaged_kit,
+    kit_of,
+    name,
+    refuses_an_old_kit,
+    refuses_in_one_line,
+    scans_of_a_loop,
+    verdict_on,
+    wrong_file,
+)
 
 NODE = shutil.which("node")
 if NODE is None or not (EMBED / "node" / "node_modules").is_dir():
     pytest.skip("node or its packages are missing (npm ci in examples/embed/node)", allow_module_level=True)
 
 pytest_plugins = ["small_laws"]
-PID = next(file for file in SHIPPED if name(file) == "thiosulfate_cstr-pid")
 
 
 def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -67,14 +79,7 @@ def test_node_gives_the_bits_of_our_runtime(file: Path, conformed: dict[Path, tu
 
 
 def test_node_refuses_results_and_takes_measured_disturbances(disobedient_file: Path, tmp_path: Path) -> None:
-    """No shipped controller has measured disturbances or leaves its range; this one does both."""
-    vectors = json.loads((kit_of(disobedient_file) / "vectors.json").read_text())
-    refused = Counter(row.get("refused", "") for row in vectors["steps"])
-    assert min(refused["output"], refused["input"], refused[""]) >= 15
-    done = run("--conformance", kit_of(disobedient_file), tmp_path / "answers.json")
-    assert done.returncode == 0, done.stdout + done.stderr
-    verdict = verdict_on(disobedient_file, tmp_path / "answers.json")
-    assert verdict.identical, verdict.text()
+    answers_refusals_and_disturbances(run, disobedient_file, tmp_path / "answers.json")
 
 
 # By damage: the largest difference in one step and chained, and how many answers are wrong.
@@ -91,29 +96,15 @@ EXPECTED = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_node_does_not_pass_a_damaged_kit(damage: str, tmp_path: Path) -> None:
-    done = run("--conformance", spoilt(PID, tmp_path, DAMAGES[damage]))
-    assert done.returncode == 1, done.stdout + done.stderr
-    assert re.search(f"largest difference {EXPECTED[damage]} wrong", done.stdout), done.stdout
+    fails_on_a_damaged_kit(run, damage, EXPECTED[damage], tmp_path)
 
 
 def test_node_refuses_an_old_kit(tmp_path: Path) -> None:
-    done = run("--conformance", spoilt(PID, tmp_path, an_old_version))
-    assert done.returncode == 2
-    assert done.stdout == ""
-    wanted = "the kit has the version 3, not 4: write it again with loopwright conformance FILE.onnx KIT"
-    assert done.stderr == f"error: {wanted}\n"
+    refuses_an_old_kit(run, tmp_path)
 
 
 def test_the_node_loop_scans_once_a_period() -> None:
-    done = run(kit_of(PID) / "pid.onnx", "40", "0.02")
-    assert done.returncode == 0, done.stderr
-    rows = [line.split() for line in done.stdout.splitlines()]
-    places = [int(row[0]) for row in rows]
-    assert places == sorted(set(places))  # a busy machine leaves some out, also at the start
-    assert places[0] >= 0
-    assert len(places) > 1
-    assert all(0 <= float(row[1]) < 20 for row in rows)
-    assert {row[4] for row in rows} == {"AUTO"}
+    scans_of_a_loop(run)
 
 
 LOOP = """
@@ -375,20 +366,4 @@ def test_what_an_operator_may_not_set_is_refused_in_node(told: dict[str, Any]) -
     ],
 )
 def test_a_file_that_is_not_right_is_one_line_of_the_node_host(what: str, words: str, tmp_path: Path) -> None:
-    for suffix in (".onnx", ".json"):
-        shutil.copy(kit_of(PID) / f"pid{suffix}", tmp_path)
-    file, manifest = tmp_path / "pid.onnx", tmp_path / "pid.json"
-    if what == "changed":
-        file.write_bytes(file.read_bytes() + b"x")
-    elif what == "missing":
-        manifest.unlink()
-    elif what != "foreign":
-        more = {"range": '"high": 5000.0', "unlimited": '"high": 500.0, "max_move": 1'}[what]
-        manifest.write_text(manifest.read_text().replace('"high": 500.0', more))
-    else:
-        shutil.copy(next(f for f in SHIPPED if f.stem == "inc").with_suffix(".json"), manifest)
-    done = run(file, "1", "0.01")
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: ")
-    assert done.stderr.count("\n") == 1
-    assert words in done.stderr
+    refuses_in_one_line(run, wrong_file(what, tmp_path), words)

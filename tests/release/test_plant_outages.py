@@ -112,7 +112,7 @@ def test_what_the_plants_operator_set_during_an_outage_is_not_written_over(
                 assert running.ask(lambda loop: loop.set_mode(Mode.MANUAL), "mode MANUAL") == ""
                 running.becomes(Mode.MANUAL, scans=3)
             cut(plant, wire)
-            assert within(20, lambda: "does not answer" in running.commands[-1].reason)
+            assert within(20, lambda: "does not answer" in running.commands[-1].fault)
             running.becomes(begin, scans=6)
             assert running.station.loop is not None
             (left,) = running.station.loop.mv.tolist()
@@ -145,9 +145,9 @@ def test_a_node_that_is_gone_while_the_connection_is_made_anew_is_found_again(
         write(plant, "Faults.MV.T_j", "deleted")
         running.becomes(Mode.HOLD)
         cut(plant, wire)
-        assert within(20, lambda: "does not answer" in running.commands[-1].reason)
+        assert within(20, lambda: "does not answer" in running.commands[-1].fault)
         mend(plant, wire)
-        assert within(30, lambda: "so its type is not known" in running.commands[-1].reason)
+        assert within(30, lambda: "so its type is not known" in running.commands[-1].fault)
         write(plant, "Faults.MV.T_j", "")
         running.becomes(Mode.AUTO, 60, scans=5)
     finally:

@@ -14,8 +14,14 @@ from loopwright.pipeline.cases.own_model import FAST, LATE, SLOW, GoneWrong, err
 from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence, LawMetrics, OverSeeds
-from loopwright.pipeline.report.gone_wrong import LATE_ALONE_FACTOR, dead_time_to_state, late_factor, wrong_rows
-from loopwright.pipeline.report.own_acceptance import against, own_acceptance
+from loopwright.pipeline.report.own_acceptance import (
+    LATE_ALONE_FACTOR,
+    against,
+    dead_time_to_state,
+    late_factor,
+    own_acceptance,
+    wrong_rows,
+)
 
 SEEDS = ("9001", "9002", "9003")
 TESTS = ("held_out", "held_out_noise", "load", "spoilt")

@@ -106,11 +106,11 @@ def test_it_takes_over_and_the_old_one_is_put_back(made: Made) -> None:
         assert command.successor_mv is not None
         assert command.successor_mv.tolist() == pytest.approx([52.0])
     assert loop.scan(sample()).mv.tolist() == pytest.approx([52.0])
-    assert "PV P is 12" in loop.scan(sample(p=12.0)).reason  # which the new one does not read
+    assert "PV P is 12" in loop.scan(sample(p=12.0)).fault  # which the new one does not read
     loop.set_mode(Mode.AUTO)
-    assert "PV T is nan" in loop.scan(sample(t=np.nan)).reason
+    assert "PV T is nan" in loop.scan(sample(t=np.nan)).fault
     loop.set_mode(Mode.AUTO)
-    assert "DV heat is nan" in loop.scan(sample(heat=np.nan)).reason
+    assert "DV heat is nan" in loop.scan(sample(heat=np.nan)).fault
     loop.set_mode(Mode.AUTO)
     assert loop.replaced is old
     loop.swap(loop.replaced, trial=1)
@@ -144,10 +144,10 @@ def test_guards_are_made_anew_for_the_ranges_of_whoever_takes_over(made: Made) -
     loop = ControlLoop(old, sp=1.0, mv=40.0, mode=Mode.AUTO, recover_after=1)
     rest = np.array([40.0]), np.zeros(1)
     high, low = (Sample(np.array([level, 300.0]), *rest) for level in (3.0, 0.8))
-    assert "PV level is 3 m, outside its range [0, 2] m" in loop.scan(high).reason
+    assert "PV level is 3 m, outside its range [0, 2] m" in loop.scan(high).fault
     loop.swap(wide, trial=1)
     loop.scan(low)
-    assert loop.scan(high).reason == ""
+    assert loop.scan(high).fault == ""
     assert loop.replaced is old
     loop.swap(old, trial=1)
     loop.scan(high)
@@ -155,7 +155,7 @@ def test_guards_are_made_anew_for_the_ranges_of_whoever_takes_over(made: Made) -
     assert "outside its range [0, 2] m" in loop.successor.reason
     loop.scan(low)
     assert loop.controller is old
-    assert "outside its range [0, 2] m" in loop.scan(high).reason
+    assert "outside its range [0, 2] m" in loop.scan(high).fault
 
 
 def test_a_host_s_own_guards_stay_and_its_maker_is_asked_again(made: Made) -> None:

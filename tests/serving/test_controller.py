@@ -33,7 +33,7 @@ from loopwright.serving.controller_file import TRAILER_BYTES, seal
 from loopwright.serving.errors import OutputError
 from loopwright.serving.graph.audit import audit
 from loopwright.serving.manifest import MANIFEST_KEY
-from loopwright.serving.rows import ControllerRows
+from loopwright.serving.vectorized_controller import VectorizedController
 
 pytest_plugins = ["small_laws"]
 FEED: dict[str, Any] = {"sp": 1.0, "pv": [0.8, 300.0], "mv_applied": [40.0], "state": [1.0, 0.1]}
@@ -591,7 +591,7 @@ def test_rows_are_steps_bit_for_bit_and_refused_as_they_are(
     pv = np.column_stack([rng.uniform(-8, 8, n), np.full(n, 300.0)])
     pv[::17, 0] = np.nan
     given = {"sp": np.ones((n, 1)), "pv": pv, "mv_applied": rng.uniform(-1, 101, (n, 1)), "state": np.zeros((n, 2))}
-    rows = ControllerRows(slow, n).step(**given, dv=np.zeros((n, 0)))
+    rows = VectorizedController(slow, n).step(**given, dv=np.zeros((n, 0)))
     refused = 0
     for k in range(n):
         try:

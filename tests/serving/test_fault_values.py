@@ -63,10 +63,10 @@ class Odd:
 def test_the_reason_of_a_command_is_a_text_as_ever(controller: Controller) -> None:
     m = controller.manifest
     loop = ControlLoop(controller, sp=[s.middle for s in m.sp], mv=[s.middle for s in m.mv], guards=[Odd()])
-    assert loop.scan(sample(*(s.middle for s in m.pv))).reason == "17"
+    assert loop.scan(sample(*(s.middle for s in m.pv))).fault == "17"
     loop = ControlLoop(controller, sp=[s.middle for s in m.sp], mv=[s.middle for s in m.mv])
-    assert loop.scan(sample(*(s.middle for s in m.pv), fault="my own words")).reason == "my own words"
-    reason = loop.scan(sample(*(1e6 for _ in m.pv), dv=np.array([s.middle for s in m.dv]))).reason
+    assert loop.scan(sample(*(s.middle for s in m.pv), fault="my own words")).fault == "my own words"
+    reason = loop.scan(sample(*(1e6 for _ in m.pv), dv=np.array([s.middle for s in m.dv]))).fault
     assert isinstance(reason, Fault)
     assert (reason.kind, reason.subject) == ("range", f"PV {m.pv[0].name}")
 
@@ -83,7 +83,7 @@ def test_a_fault_that_passes_from_one_signal_to_another_is_told(make: Any, tmp_p
     loop: Any = SimpleNamespace(controller=controller, successor=None)
     for reason in (make("TIC-101"), make("TIC-101"), make("TIC-102"), ""):
         command: Any = SimpleNamespace(
-            sp=(), mv=(), writes=False, law_mv=None, successor_mv=None, info=None, reason=reason, mode=Mode.HOLD
+            sp=(), mv=(), writes=False, law_mv=None, successor_mv=None, info=None, fault=reason, mode=Mode.HOLD
         )
         recorder.scan(loop, None, command)
     journal.close()
@@ -95,7 +95,7 @@ def test_no_words_change_the_mode(tmp_path: Path) -> None:
     recorder = Recorder(journal, said.append)
     recorder.note("change", "anna", "mode AUTO", mode=Mode.AUTO)
     recorder.note("change", "anna", "mode of the pump: SHADOW")
-    command: Any = SimpleNamespace(mode=Mode.HOLD, reason="a fault")
+    command: Any = SimpleNamespace(mode=Mode.HOLD, fault="a fault")
     recorder._changed(command)
     journal.close()
     assert said[-1] == "loop: mode AUTO -> HOLD (a fault)"

@@ -136,7 +136,7 @@ def test_a_session_outlives_periods_that_are_longer_than_it(
 ) -> None:
     running = RunningLoop(settings(tmp_path, server, PERIOD_S))  # which waits for three scans
     running.end()
-    assert [(c.mode, c.reason) for c in running.commands[:3]] == [(Mode.AUTO, "")] * 3
+    assert [(c.mode, c.fault) for c in running.commands[:3]] == [(Mode.AUTO, "")] * 3
     assert running.station.endpoint.connections == 1
     assert sessions == [60.0]
     assert opens.count(ua.SecurityTokenRequestType.Renew) >= 2

@@ -270,7 +270,8 @@ def test_where_there_are_several_leases_nothing_is_written_and_all_is_read(contr
     assert plan.unwritable.startswith("lease: there are 2 nodes LoopwrightLease beside the MVs")
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
     endpoint: Any = OpcUaEndpoint(m, server, nodes, max_age_s=1.0)
-    endpoint._barred, endpoint._link, endpoint._told_on, endpoint._shown_on = plan.unwritable, object(), 1, 1
+    endpoint._link, sender = object(), endpoint.sender
+    sender.barred, sender.told_on, sender.shown_on = plan.unwritable, 1, 1
     with pytest.raises(EndpointError, match="lease: there are 2 nodes"):
         endpoint.write([50.0])
-    assert not endpoint._outbox
+    assert not sender.outbox

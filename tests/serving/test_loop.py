@@ -179,16 +179,16 @@ def test_a_bad_sample_holds_with_its_reason(make_loop: Callable[..., ControlLoop
     before = loop.scan(sample()).mv
     command = loop.scan(bad)
     assert command.mode is Mode.HOLD
-    assert reason in command.reason
+    assert reason in command.fault
     assert np.array_equal(command.mv, before)
     assert command.law_mv is None
     # Good samples alone do not end it: an operator must, unless recover_after says otherwise.
     for _ in range(10):
         command = loop.scan(sample())
         assert (command.mode, np.array_equal(command.mv, before)) == (Mode.HOLD, True)
-        assert reason in command.reason
+        assert reason in command.fault
     loop.set_mode(Mode.AUTO)
-    assert loop.scan(sample()).reason == ""
+    assert loop.scan(sample()).fault == ""
 
 
 def test_recovery_needs_good_samples_in_a_row_and_starts_cold(make_loop: Callable[..., ControlLoop]) -> None:
@@ -203,7 +203,7 @@ def test_a_law_error_holds_the_applied_mv(make_loop: Callable[..., ControlLoop],
     loop.scan(sample())
     command = loop.scan(sample(math.nan, 37.0))  # no guard: the controller itself refuses
     assert (command.mode, command.mv.tolist()) == (Mode.HOLD, [37.0])
-    assert "level [m] is nan" in command.reason
+    assert "level [m] is nan" in command.fault
 
     def explode(**_: Any) -> None:
         raise RuntimeError("out of memory")
@@ -211,7 +211,7 @@ def test_a_law_error_holds_the_applied_mv(make_loop: Callable[..., ControlLoop],
     loop.set_mode(Mode.AUTO)
     with monkeypatch.context() as patch:
         patch.setattr(loop.controller, "step", explode)
-        assert loop.scan(sample()).reason == "out of memory"
+        assert loop.scan(sample()).fault == "out of memory"
 
 
 def slow_loop(shared: Controller, **options: Any) -> ControlLoop:
@@ -234,7 +234,7 @@ def test_a_move_beyond_the_mvs_rate_is_a_fault_and_never_written(shared: Control
     assert loop.scan(sample(-2.8)).mv[0] == pytest.approx(44.94)
     loop = slow_loop(shared, guards=())
     command = loop.scan(sample(-2.9))
-    assert (command.mode, command.mv.tolist(), bool(command.reason)) == (Mode.HOLD, [40.0], True)
+    assert (command.mode, command.mv.tolist(), bool(command.fault)) == (Mode.HOLD, [40.0], True)
     # Others moved the valve while the loop could not write: the law moves from there.
     loop = slow_loop(shared, guards=())
     before = loop.mv
@@ -322,15 +322,15 @@ def test_who_takes_over_is_held_to_its_own_rate(shared: Controller) -> None:
 def test_a_guard_that_fails_does_not_clear_the_sample(make_loop: Callable[..., ControlLoop]) -> None:
     loop = make_loop(guards=(Rate((), (0.1,)),))
     assert loop.scan(sample()).mode is Mode.AUTO
-    assert "Rate failed" in loop.scan(sample()).reason
+    assert "Rate failed" in loop.scan(sample()).fault
 
 
 def test_manual_survives_faults(make_loop: Callable[..., ControlLoop]) -> None:
     loop = make_loop(mode=Mode.MANUAL)
     command = loop.scan(sample(math.nan))
     assert (command.mode, command.mv.tolist()) == (Mode.MANUAL, [40.0])
-    assert "nan" in command.reason
-    assert loop.scan(sample()).reason == ""
+    assert "nan" in command.fault
+    assert loop.scan(sample()).fault == ""
 
 
 @settings(deadline=None)
@@ -367,9 +367,9 @@ def test_an_unreachable_plant_is_a_fault_and_no_exception(make_loop: Callable[..
     commands: list[Command] = []
     report = make_loop(tank, recover_after=2).run(20, observe=lambda _, c: commands.append(c))
     assert [c.scan for c in commands] == list(range(20))
-    assert [bool(c.reason) for c in commands] == [k in (5, 6, 7, 12, 13) for k in range(20)]
-    assert "no route" in commands[5].reason
-    assert "does not answer" in commands[12].reason
+    assert [bool(c.fault) for c in commands] == [k in (5, 6, 7, 12, 13) for k in range(20)]
+    assert "no route" in commands[5].fault
+    assert "does not answer" in commands[12].fault
     assert np.array_equal(commands[12].mv, commands[11].mv)  # what was decided never arrived
     assert report.faults == 5
     assert commands[-1].mode is Mode.AUTO
@@ -422,11 +422,11 @@ def test_no_shipped_law_commands_an_implausible_read_back(path: Path, monkeypatc
                     command = loop.scan(Sample(mv_applied=np.full(len(m.mv), value), **good))
                 assert command.mode is Mode.HOLD
                 assert command.mv.tolist() == rest.tolist()
-                assert f"applied MV {m.mv[0].name} is " in command.reason
+                assert f"applied MV {m.mv[0].name} is " in command.fault
                 loop.set_mode(Mode.MANUAL)
                 command = loop.scan(Sample(mv_applied=np.full(len(m.mv), value), **good))
                 assert (command.mode, command.mv.tolist()) == (Mode.MANUAL, rest.tolist())
-                assert f"applied MV {m.mv[0].name} is " in command.reason
+                assert f"applied MV {m.mv[0].name} is " in command.fault
 
 
 @pytest.mark.parametrize("guards", [None, ()])
@@ -441,7 +441,7 @@ def test_hold_clips_a_read_back_that_its_scaling_carries_out_of_range(
     monkeypatch.setattr(loop.controller, "step", refuse)
     command = loop.scan(sample(0.8, read_back))
     assert (command.mode, command.mv.tolist()) == (Mode.HOLD, [held])
-    assert ("outside its range [0, 100] %" in command.reason) is (held == 40.0)
+    assert ("outside its range [0, 100] %" in command.fault) is (held == 40.0)
 
 
 def test_the_law_gets_the_end_of_the_range_for_a_read_back_beyond_it(
@@ -449,7 +449,7 @@ def test_the_law_gets_the_end_of_the_range_for_a_read_back_beyond_it(
 ) -> None:
     expected = shared.step(sp=1.0, pv=[0.8, 300.0], mv_applied=100.0, state=shared.cold_state())
     command = make_loop().scan(sample(0.8, 101.5))
-    assert (command.reason, command.mv.tolist()) == ("", expected.mv.tolist())
+    assert (command.fault, command.mv.tolist()) == ("", expected.mv.tolist())
 
 
 def test_a_host_that_writes_into_a_command_moves_nothing(make_loop: Callable[..., ControlLoop]) -> None:
@@ -488,8 +488,8 @@ def test_what_is_no_sample_is_a_fault_with_its_reason(make_loop: Callable[..., C
     ((given, command),) = seen
     assert given is (junk if isinstance(junk, Sample) else None)
     assert (report.faults, report.errors, command.mode, tank.written) == (1, 0, Mode.HOLD, [40.0, 40.0])
-    assert "failed" not in command.reason  # a guard that says why, not one that broke
-    assert any(word in command.reason for word in ("must be", "needs", "instead of"))
+    assert "failed" not in command.fault  # a guard that says why, not one that broke
+    assert any(word in command.fault for word in ("must be", "needs", "instead of"))
 
 
 # ---------------------------------------------------------------------- whatever raises
@@ -528,8 +528,8 @@ def test_whatever_raises_ahead_of_the_write_is_a_fault_that_names_its_type(
     assert (report.scans, report.faults, report.errors) == (3, 3, 0)
     assert loop.mode is Mode.HOLD
     for command in commands:
-        assert type(error).__name__ in command.reason
-        assert "\n" not in command.reason
+        assert type(error).__name__ in command.fault
+        assert "\n" not in command.fault
         assert command.mv.tolist() == [40.0]
     assert tank.written == [40.0] * (1 if where == "write" else 4)
 
@@ -545,10 +545,10 @@ def test_a_law_or_guard_that_raises_without_a_text_is_still_a_fault(
         check = raised
 
     loop = make_loop(guards=(Broken(make_loop().controller.manifest),))
-    assert loop.scan(sample()).reason.startswith("Broken failed: ")
+    assert loop.scan(sample()).fault.startswith("Broken failed: ")
     loop = make_loop()
     monkeypatch.setattr(loop.controller, "step", raised)
-    assert loop.scan(sample()).reason
+    assert loop.scan(sample()).fault
     assert (loop.mode, bool(loop.fault)) == (Mode.HOLD, True)
 
 
@@ -600,7 +600,7 @@ def test_a_clock_that_fails_holds_and_the_machines_own_measures_the_period(
         6, before=before, observe=lambda _, c: commands.append(c)
     )
     assert (report.scans, report.faults) == (6, 2)
-    assert [c.reason.startswith("the clock failed: ") for c in commands] == [False, False, True, True, False, False]
+    assert [c.fault.startswith("the clock failed: ") for c in commands] == [False, False, True, True, False, False]
     assert spare.now() == 2 * PERIOD
     assert commands[3].mv.tolist() == commands[1].mv.tolist()
     assert commands[5].mode is Mode.AUTO
@@ -704,11 +704,11 @@ class Chaos:
 
     def observe(self, _: Sample | None, command: Command) -> None:
         self.shadowed += command.mode is Mode.SHADOW
-        self.outside = self.outside or "nothing is written before it is back" in command.reason
+        self.outside = self.outside or "nothing is written before it is back" in command.fault
         if not (command.mode is Mode.SHADOW or command.writes or command.hand_back):
-            assert self.outside or "nothing is written before a good read-back tells" in command.reason
+            assert self.outside or "nothing is written before a good read-back tells" in command.fault
             assert np.isnan(command.mv).all()
-            self.left += not command.reason.startswith("the plant cannot be written")
+            self.left += not command.fault.startswith("the plant cannot be written")
         assert command.law_mv is None or legal(command.law_mv, self.m.mv)
         assert command.successor_mv is None or legal(command.successor_mv, self.m.mv)
         for array in (command.law_mv, command.info, command.sp, command.successor_mv):

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from loopwright.serving import Command, Controller, Manifest, Mode, Sample, Signal
 from loopwright.serving.monitor import Monitor
-from loopwright.serving.monitor.actuator_checks import Plight
+from loopwright.serving.monitor.actuator_checks import ActuatorFaults
 from loopwright.serving.monitor.cusum import Chart, correlation, dead_times, run_limit, settle_scans, upper_scatter
 from loopwright.serving.monitor.loop_statistics import Foresight, Swing, harris_index
 from loopwright.serving.monitor.plant_drift import Answers, RestMap
@@ -283,7 +283,7 @@ def test_nothing_that_a_loop_gives_raises_and_its_memory_is_bounded() -> None:
     size = len(json.dumps(monitor.state()))
     rng = np.random.default_rng(0)
     strange: list[tuple[Sample | None, Command]] = [
-        (None, command(0, Mode.HOLD, reason="lost")),
+        (None, command(0, Mode.HOLD, fault="lost")),
         (Sample(np.array([np.nan])), command(0)),
         (Sample(np.array([np.inf])), command(0)),
         (Sample(np.zeros(3)), command(0)),
@@ -468,7 +468,7 @@ def test_a_forged_memory_is_refused_or_does_no_harm(data: st.DataObject) -> None
 
 def test_a_monitor_that_fails_says_so_and_never_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     monitor = Monitor.restored(manifest(), learnt())
-    monkeypatch.setattr(monitor, "plight", None)
+    monkeypatch.setattr(monitor, "actuators", None)
     monkeypatch.setattr(monitor, "saturated", None)
     (said,) = monitor.verdicts()
     assert (said.name, said.level) == ("monitor", "watch")
@@ -482,8 +482,8 @@ def test_every_shipped_controller_has_a_monitor(controller: Controller) -> None:
     assert all(v.text for v in monitor.verdicts())
 
 
-def watched(mv: np.ndarray, error: float, patience: int = 50) -> Plight:
-    made = Plight([Signal("u", "%", 0.0, 100.0)], patience)
+def watched(mv: np.ndarray, error: float, patience: int = 50) -> ActuatorFaults:
+    made = ActuatorFaults([Signal("u", "%", 0.0, 100.0)], patience)
     for k, value in enumerate(mv):
         made.add(np.array([value]), error, float(k))
     return made
@@ -507,12 +507,12 @@ def test_an_mv_that_turns_round_at_each_scan_flutters_and_noise_does_not() -> No
     assert not watched(to_and_fro[:80], 0.0).flutters(0)
     assert not watched(50 + 0.1 * (to_and_fro - 50), 0.0).flutters(0)
     # Independent values turn round at two of three scans, steps of a walk at half of them.
-    noisy = Plight([Signal("u", "%", 0.0, 100.0)], 50)
+    noisy = ActuatorFaults([Signal("u", "%", 0.0, 100.0)], 50)
     for k, value in enumerate(50 + 10 * rng.normal(size=20_000)):
         noisy.add(np.array([value]), 0.0, float(k))
         assert not noisy.flutters(0), k
     assert not watched(50 + 5 * np.sin(np.arange(2_000) / 5) + rng.normal(size=2_000), 0.0).flutters(0)
-    discrete = Plight([Signal("v", "-", 0.0, 1.0, values=(0.0, 1.0))], 50)
+    discrete = ActuatorFaults([Signal("v", "-", 0.0, 1.0, values=(0.0, 1.0))], 50)
     for k in range(100):
         discrete.add(np.array([float(k % 2)]), 0.0, float(k))
     assert not discrete.flutters(0)

@@ -24,7 +24,7 @@ from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import ModeNode, Nodes, Point, Server
 from loopwright.serving.opcua.values import BusyError, LateError, NodeReading
 from loopwright.serving.station.build_loop import keep_namespaces, keep_nodes, namespaces_before, nodes_before
-from loopwright.serving.station.requests import Wishes
+from loopwright.serving.station.requests import NodeRequests
 
 pytest_plugins = ["small_laws"]
 UA_SPACE = "http://opcfoundation.org/UA/"
@@ -192,8 +192,8 @@ def test_a_node_of_another_type_is_a_fault_while_it_is(name: str, manifest: Mani
     assert valued(made, plan).fault == ""
     other = valued(made, plan, **{name.replace(" ", "_"): INT32})
     assert other.fault.startswith(f"{name}: its type is Int32 now and was Double") is used
-    wishes = Wishes()
-    assert [len(wishes.refused(v)) for v in (other, other, valued(made, plan), other)] == [wish, 0, 0, wish]
+    asked = NodeRequests()
+    assert [len(asked.refused(v)) for v in (other, other, valued(made, plan), other)] == [wish, 0, 0, wish]
     assert (other.asked_mode, bool(other.asked_sp)) == ("" if name == "mode" else "AUTO", name != "SP level")
     assert np.isnan(other.mv[0]) == (name == "MV valve")
     assert valued(made, plan).fault == ""
@@ -222,12 +222,13 @@ def test_an_mv_whose_written_node_is_another_one_is_not_written_and_its_sample_i
         assert made.fault == valued(made, plan).fault == ""
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
     endpoint = OpcUaEndpoint(manifest, server, made.nodes, max_age_s=1.0)
-    endpoint.nameplates, endpoint._link, endpoint._told_on, endpoint._shown_on = made, link, 1, 1  # type: ignore[assignment]
+    endpoint.nameplates, endpoint._link = made, link  # type: ignore[assignment]
+    endpoint.sender.told_on = endpoint.sender.shown_on = 1
     with pytest.raises(EndpointError, match="MV valve, written: "):
         endpoint.write(np.array([50.0]))
-    endpoint._outbox.append(np.array([50.0]))  # passed on before it was known
-    asyncio.run(endpoint._send(link, plan))  # type: ignore[arg-type]
-    assert endpoint.unwritten == made.unwritable
+    endpoint.sender.outbox.append(np.array([50.0]))  # passed on before it was known
+    asyncio.run(endpoint.sender.send(link, plan, made))  # type: ignore[arg-type]
+    assert endpoint.sender.unwritten == made.unwritable
     link.kinds, link.units, link.ends = {}, {}, {}
     asyncio.run(made.again(link, plan, 1.0))  # type: ignore[arg-type]
     assert made.unwritable == ""

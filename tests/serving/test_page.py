@@ -22,9 +22,8 @@ from processes import lives, within
 from loopwright.serving import Controller, LoopError
 from loopwright.serving.journal import EventEntry, Journal, JournalReader, ScanEntry
 from loopwright.serving.page.live import Live
-from loopwright.serving.page.process import PageProcess
-from loopwright.serving.page.settings import Page
-from loopwright.serving.page.trend import Modes, Thinned, trend
+from loopwright.serving.page.process import Page, PageProcess
+from loopwright.serving.page.trend import BinnedExtremes, Modes, trend
 
 pytest_plugins = ["small_laws"]
 
@@ -235,7 +234,7 @@ OWNER = """
 import sys
 from pathlib import Path
 from loopwright.serving.page.process import PageProcess
-from loopwright.serving.page.settings import Page
+from loopwright.serving.page.process import Page
 page = PageProcess(Page("127.0.0.1:0"), Path(sys.argv[1]), Path(sys.argv[2]), print)
 print(page._process.pid, flush=True)
 sys.stdin.read()
@@ -311,7 +310,7 @@ def test_thinning_keeps_the_extremes_of_every_bin(seed: int) -> None:
     times = np.sort(rng.uniform(0, 1000, n))
     values = rng.normal(size=n).cumsum()
     values[rng.random(n) < 0.2] = np.nan
-    thinned = Thinned(0.0, 1000.0, points)
+    thinned = BinnedExtremes(0.0, 1000.0, points)
     for part in np.array_split(np.arange(n), 7):
         thinned.add(times[part], {"pv a": values[part]})
     at, columns = thinned.rows()

@@ -20,8 +20,8 @@ from page_requests import BODY, broken, whole
 from processes import within
 
 from loopwright.serving import Controller
+from loopwright.serving.page import access, live
 from loopwright.serving.page import app as page_app
-from loopwright.serving.page import live, patience
 from loopwright.serving.page.app import PageApp
 
 ARTIFACTS = Path(__file__).parents[2] / "artifacts" / "thiosulfate_cstr"
@@ -204,7 +204,7 @@ def serving_here(loop: FakeLoop) -> Iterator[tuple[PageApp, Browser, uvicorn.Ser
         port = int(listening.getsockname()[1])
         config = uvicorn.Config(
             app.asgi([f"127.0.0.1:{port}"], "http"),
-            http=patience.Impatient, ws="none", log_config=None, access_log=False, timeout_graceful_shutdown=1,
+            http=access.TimedConnection, ws="none", log_config=None, access_log=False, timeout_graceful_shutdown=1,
         )  # fmt: skip
         server = uvicorn.Server(config)
         thread = threading.Thread(target=asyncio.run, args=(server.serve([listening]),), daemon=True)
@@ -238,7 +238,7 @@ def ends(wire: socket.socket) -> bool:
 
 def test_who_takes_his_time_is_cut_off(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     """Slow-loris: connections that never finish a request, or begin a second one and never finish that."""
-    monkeypatch.setattr(patience, "REQUEST_S", 0.4)
+    monkeypatch.setattr(access, "REQUEST_S", 0.4)
     with serving_here(loop) as (_, browser, _):
         first = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n\r\n" % browser.port
         open_ones = [
@@ -258,8 +258,8 @@ def healthy(browser: Browser) -> bool:
 
 
 def test_many_connections_keep_nobody_out(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "MOST_CONNECTIONS", 20)
-    monkeypatch.setattr(patience, "REQUEST_S", 600.0)
+    monkeypatch.setattr(access, "MOST_CONNECTIONS", 20)
+    monkeypatch.setattr(access, "REQUEST_S", 600.0)
     with serving_here(loop) as (_, browser, _):
         idle = [connected(browser.port, b"GET / HTTP/1.1\r\n") for _ in range(50)]
         assert browser.get("/healthz")[0] == 200
@@ -275,7 +275,7 @@ TREND = "GET /api/trend?from=0&to=100 HTTP/1.1"
 
 def test_many_busy_connections_keep_nobody_out(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
     """Streams and trends that somebody keeps waiting: those that are open longest go when a newcomer comes."""
-    monkeypatch.setattr(patience, "MOST_CONNECTIONS", 20)
+    monkeypatch.setattr(access, "MOST_CONNECTIONS", 20)
     go = threading.Event()
     with serving_here(loop) as (app, browser, server):
         monkeypatch.setattr(app, "_trend", lambda *_: str(go.wait(60)))
@@ -340,7 +340,7 @@ def test_as_many_pages_as_are_allowed_are_sent_news(loop: FakeLoop, monkeypatch:
 
 
 def test_who_never_reads_holds_little_and_is_cut_off(loop: FakeLoop, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(patience, "STALLED_S", 1.5)  # the second one is seen before it is cut off
+    monkeypatch.setattr(access, "STALLED_S", 1.5)  # the second one is seen before it is cut off
     with serving_here(loop) as (app, browser, server):
         deaf = connected(browser.port, raw(browser.port, "token", LIVE, body=b""), room=4_096)
         assert within(10, lambda: len(app.live._pages) == 1)

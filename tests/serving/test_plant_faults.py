@@ -121,13 +121,13 @@ def test_a_fault_holds_and_is_recovered_from(
     begun_at = len(running.commands)
     begin(plant, wire)
     until_hold = running.becomes(Mode.HOLD, 10)
-    reason = running.commands[-1].reason
+    reason = running.commands[-1].fault
 
     def named() -> bool:
         """A busy machine may be the reason of the first scans."""
-        return any(words in c.reason for c in running.commands[begun_at:] if c.mode is Mode.HOLD)
+        return any(words in c.fault for c in running.commands[begun_at:] if c.mode is Mode.HOLD)
 
-    assert within(20, named), {c.reason for c in running.commands[begun_at:]}
+    assert within(20, named), {c.fault for c in running.commands[begun_at:]}
     running.becomes(Mode.HOLD, scans=10)
     assert within(20, lambda: stands(running))
     end(plant, wire)
@@ -154,13 +154,13 @@ def held_by_the_watchdog(running: RunningLoop, plant: Plant) -> bool:
     write(plant, "Faults.Control.Watchdog", "frozen")
     stood = read(plant, "Control.Watchdog")
     stands = f"the plant's watchdog has stood at {stood} for "
-    assert within(30, lambda: any(c.reason.startswith(stands) for c in running.commands[at:]))
+    assert within(30, lambda: any(c.fault.startswith(stands) for c in running.commands[at:]))
     running.becomes(Mode.HOLD, scans=10)
-    first = next(c for c in running.commands[at:] if c.reason)
+    first = next(c for c in running.commands[at:] if c.fault)
     assert first.mode is Mode.HOLD
     write(plant, "Faults.Control.Watchdog", "")
     running.becomes(Mode.AUTO, 60)
-    return first.reason == f"{stands}3 scans"
+    return first.fault == f"{stands}3 scans"
 
 
 def test_a_plant_whose_watchdog_stands_is_held_within_three_periods(plant: Plant, wire: Wire, tmp_path: Path) -> None:
@@ -203,9 +203,9 @@ def test_a_loop_whose_certificate_is_rejected_holds_until_it_is_trusted_again(
     trusted.unlink()
     strict.start()
     rejected = f"let the server trust {own}"
-    assert within(60, lambda: rejected in running.commands[-1].reason), running.told
+    assert within(60, lambda: rejected in running.commands[-1].fault), running.told
     running.becomes(Mode.HOLD, scans=10)
-    reason = running.commands[-1].reason
+    reason = running.commands[-1].fault
     assert within(20, lambda: stands(running))
     asked = {row["asked"][0] for row in strict.actuator()[-3:]}
     strict.end()
@@ -225,7 +225,7 @@ def test_a_loop_whose_certificate_is_rejected_holds_until_it_is_trusted_again(
 
 def aged_by_a_clock(commands: list[Command]) -> list[str]:
     """Why scans were held whose sample counted as older than any that a busy machine delivers."""
-    ages = [(c.reason, re.match(r"the sample(?: of .+)? is (\S+) s old", c.reason)) for c in commands]
+    ages = [(c.fault, re.match(r"the sample(?: of .+)? is (\S+) s old", c.fault)) for c in commands]
     return [reason for reason, age in ages if age and float(age[1]) > 60]
 
 
@@ -245,8 +245,8 @@ def held_by_the_clock(
         with capsys.disabled():
             print(f"\n{name:28} no HOLD")
         return False
-    until_hold, held = sum(not c.reason for c in rows[: aged[0]]), aged[-1] - aged[0] + 1
-    show(capsys, name, until_hold, held, rows[aged[0]].reason)
+    until_hold, held = sum(not c.fault for c in rows[: aged[0]]), aged[-1] - aged[0] + 1
+    show(capsys, name, until_hold, held, rows[aged[0]].fault)
     assert until_hold <= 5
     assert held <= CONNECTED
     return True

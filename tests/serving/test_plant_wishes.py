@@ -21,7 +21,7 @@ def test_an_mv_node_of_another_type_is_not_written_while_it_is(plant: Plant, wir
     try:
         write(plant, "Faults.MV.T_j", "int")
         changed = "MV T_j, written: its type is Int32 now and was Double"
-        assert within(30, lambda: changed in running.commands[-1].reason), running.told
+        assert within(30, lambda: changed in running.commands[-1].fault), running.told
         running.becomes(Mode.HOLD, scans=8)
         asked = {row["asked"][0] for row in plant.actuator()[-6:]}
         assert len(asked) == 1

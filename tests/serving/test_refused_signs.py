@@ -116,7 +116,7 @@ class Scanning:
             self.endpoint.write(np.array([1.0]))
         except EndpointError as error:
             fault = fault or str(error)
-        assert within(20, lambda: self.link.reads > before and not self.endpoint._outbox)
+        assert within(20, lambda: self.link.reads > before and not self.endpoint.sender.outbox)
         return fault
 
     def becomes(self, fault: str) -> bool:
@@ -171,17 +171,17 @@ def test_a_heartbeat_that_holds_no_number_is_a_fault(scanning: Scanning, link: M
 
 
 def test_a_lease_that_is_refused_is_lost_and_nothing_more_is_written(scanning: Scanning, link: MadeUpLink) -> None:
-    assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
+    assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.sender.lease.held)
     link.refuses[LEASE] = REFUSED
     assert scanning.becomes("the server refuses lease: BadNotWritable")
-    assert not scanning.endpoint.lease.held
+    assert not scanning.endpoint.sender.lease.held
     mv = next(name for name in link.held if "mv." in name)
     link.held[mv] = "as it was left"
     for _ in range(10):
         scanning.scan()
     assert link.held[mv] == "as it was left"
     link.refuses.clear()
-    assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
+    assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.sender.lease.held)
     assert link.held[mv] == 1.0
 
 
@@ -191,7 +191,7 @@ def test_a_lease_that_another_loop_took_is_told_also_while_the_mv_rests(
     """An MV that stands is not sent for a long time, and the other loop moves it meanwhile."""
     scanning = Scanning(controller, link, rewrite_s=1e9)
     try:
-        assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
+        assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.sender.lease.held)
         for _ in range(5):
             assert scanning.scan() == ""
         mv = next(name for name in link.held if "mv." in name)
@@ -200,7 +200,7 @@ def test_a_lease_that_another_loop_took_is_told_also_while_the_mv_rests(
         assert link.held[LEASE] == "other:1:a 1e6 1"
         assert link.held[mv] == "as the other one has it"
         link.held[LEASE] = ""  # it has given it back
-        assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.lease.held)
+        assert within(20, lambda: scanning.scan() == "" and scanning.endpoint.sender.lease.held)
         assert link.held[mv] == 1.0
     finally:
         scanning.endpoint.close()

@@ -30,7 +30,7 @@ def endpoint(controller: Controller, rewrite_s: float, clock: Clock) -> OpcUaEnd
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, rewrite_s=rewrite_s)
     made = OpcUaEndpoint(m, server, Nodes(**nodes), max_age_s=1.0, clock=clock)
     made._link = object()  # type: ignore[assignment]
-    made._shown_on = made._told_on = 1  # it is known where the MV stands
+    made.sender.shown_on = made.sender.told_on = 1  # it is known where the MV stands
     return made
 
 
@@ -38,12 +38,12 @@ def written(made: OpcUaEndpoint, clock: Clock, mvs: list[float | None]) -> list[
     """Scan by scan 0.5 s apart, whether an MV went out; None: a scan that writes nothing."""
     out = []
     for mv in mvs:
-        made._scans += 1
+        made.sender.scans += 1
         clock.now += 0.5
         if mv is not None:
             made.write(np.array([mv]))
-        out.append(bool(made._outbox))
-        made._outbox.clear()
+        out.append(bool(made.sender.outbox))
+        made.sender.outbox.clear()
     return out
 
 
@@ -63,10 +63,10 @@ def test_whoever_had_the_plant_meanwhile_it_is_written_again(controller: Control
     clock = Clock()
     made = endpoint(controller, 100.0, clock)
     assert written(made, clock, [1.0, 1.0, None, 1.0]) == [True, False, False, True]
-    made.unwritten = "the server refuses"
+    made.sender.unwritten = "the server refuses"
     with pytest.raises(Exception, match="the server refuses"):
         written(made, clock, [1.0])
-    assert not made._outbox  # the loop holds the MV before it, so it must not go out
+    assert not made.sender.outbox  # the loop holds the MV before it, so it must not go out
     assert written(made, clock, [1.0]) == [True]
 
 

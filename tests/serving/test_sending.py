@@ -37,7 +37,7 @@ class Plant:
     def reads(self) -> None:
         """An answer to a request of now."""
         self.reads_late()
-        self.endpoint._shown_on = 1
+        self.endpoint.sender.shown_on = 1
 
     def reads_late(self) -> None:
         """An answer to a request of before the last write."""
@@ -47,7 +47,7 @@ class Plant:
     def sends(self) -> None:
         """What waits goes out."""
         plan: Any = SimpleNamespace(variants=list, hand_back=lambda: "owner", lease=None)
-        asyncio.run(self.endpoint._send(self, plan))  # type: ignore[arg-type]
+        asyncio.run(self.endpoint.sender.send(self, plan, self.endpoint.nameplates))  # type: ignore[arg-type]
 
     async def write(self, rows: list[Any], _: float) -> list[int]:
         if self.refuses:
@@ -74,7 +74,7 @@ def loop(controller: Controller, plant: Plant) -> ControlLoop:
 def scan(loop: ControlLoop, plant: Plant) -> str:
     """One scan whose MV goes out at once; its reason."""
     reasons: list[str] = []
-    loop.run(1, observe=lambda _, command: reasons.append(command.reason))
+    loop.run(1, observe=lambda _, command: reasons.append(command.fault))
     plant.sends()
     return reasons[0]
 
@@ -139,7 +139,7 @@ def test_a_read_back_of_before_a_write_that_failed_does_not_tell_where_the_mv_st
 def test_what_the_loop_is_told_did_not_arrive_does_not_go_out_afterwards(plant: Plant) -> None:
     plant.endpoint.read()
     plant.endpoint.write(np.array([60.0]))
-    plant.endpoint.unwritten = "the server refuses valve"
+    plant.endpoint.sender.unwritten = "the server refuses valve"
     with pytest.raises(EndpointError, match="the server refuses valve"):
         plant.endpoint.write(np.array([61.0]))
     plant.sends()

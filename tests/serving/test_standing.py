@@ -135,8 +135,8 @@ def test_nothing_is_written_while_the_read_back_stays_bad(
     assert line.written == []
     assert loop.mode is (Mode.MANUAL if mode is Mode.MANUAL else Mode.HOLD)
     assert not any(command.writes for command in commands)
-    assert all("nothing is written before a good read-back tells where the MV stands" in c.reason for c in commands)
-    assert all(("PV level: Bad" in c.reason) is line.pv_bad for c in commands)
+    assert all("nothing is written before a good read-back tells where the MV stands" in c.fault for c in commands)
+    assert all(("PV level: Bad" in c.fault) is line.pv_bad for c in commands)
     line.rb_bad = line.rb_gone = False
     loop.run(1)
     assert line.written == [68.0 if mode is Mode.AUTO else 71.0]  # on the way to the safe MV from where the MV stands
@@ -271,7 +271,7 @@ def test_an_mv_that_was_set_outside_the_range_meanwhile_is_left_there(
     loop.run(3)
     outage(loop, line, 50, 130.0)
     line.pv_bad = pv_bad
-    loop.run(10, observe=lambda _, command: reasons.append(command.reason))
+    loop.run(10, observe=lambda _, command: reasons.append(command.fault))
     assert line.written == []
     assert all("applied MV valve is 130 %, outside its range" in reason for reason in reasons)
     assert all("nothing is written before it is back" in reason for reason in reasons)

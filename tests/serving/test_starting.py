@@ -146,7 +146,7 @@ def test_an_actuator_outside_the_controllers_range_is_left_there(
     journalled: list[Any] = []
 
     def seen(_: Sample | None, command: Command) -> None:
-        reasons.append(command.reason)
+        reasons.append(command.fault)
         journalled.append(json.loads(json.dumps(state(made), allow_nan=False))["mv"])
         if made.scans == 8:
             assert plant.written == []

@@ -83,7 +83,7 @@ def test_a_shadow_steps_the_law_and_writes_nothing(make_loop: Callable[..., Cont
 def test_a_shadow_sees_faults_and_stays_a_shadow(make_loop: Callable[..., ControlLoop]) -> None:
     loop = make_loop(mode=Mode.SHADOW, recover_after=1)
     command = loop.scan(sample(fault="PV level: Bad (sensor failure)"))
-    assert (command.mode, command.reason, command.law_mv) == (Mode.SHADOW, "PV level: Bad (sensor failure)", None)
+    assert (command.mode, command.fault, command.law_mv) == (Mode.SHADOW, "PV level: Bad (sensor failure)", None)
     assert loop.fault == ""
     assert loop.scan(sample()).mode is Mode.SHADOW
 
@@ -107,7 +107,7 @@ def test_a_shadow_that_does_not_know_where_the_mv_stands_moves_nothing(
 def test_an_endpoint_that_does_not_trust_its_sample_is_a_fault(make_loop: Callable[..., ControlLoop]) -> None:
     loop = make_loop(guards=())
     command = loop.scan(sample(mv=55.0, fault="DV inflow: Uncertain"))
-    assert (command.mode, command.reason, command.mv.tolist()) == (Mode.HOLD, "DV inflow: Uncertain", [40.0])
+    assert (command.mode, command.fault, command.mv.tolist()) == (Mode.HOLD, "DV inflow: Uncertain", [40.0])
 
 
 # ---------------------------------------------------------------------- transfer
@@ -129,7 +129,7 @@ def test_a_shipped_law_takes_over_without_a_bump(path: Path, before: Mode) -> No
     span = np.array([s.high - s.low for s in m.mv])
     continuous = np.array([s.values is None for s in m.mv])
     move = (np.abs(loop.scan(rest).mv - test.mv0) / span)[continuous]
-    if LAWS[m.law].incremental:
+    if LAWS[m.law].velocity_form:
         assert np.all(move < 1e-6)
     else:
         assert np.all(move <= 1 / periods * (1 + 1e-12))
@@ -224,7 +224,7 @@ def test_a_safe_mv_is_reached_at_its_rate(make_loop: Callable[..., ControlLoop])
     assert line.written == [40.0, 40.0, 37.0, 34.0, 31.0, 28.0, 25.0, 22.0, 20.0, 20.0, 20.0, 20.0]
     line.away = False
     reasons: list[Any] = []
-    loop.run(2, observe=lambda s, c: reasons.append((c.mode, c.reason)))
+    loop.run(2, observe=lambda s, c: reasons.append((c.mode, c.fault)))
     assert reasons == [(Mode.HOLD, "the plant cannot be read: no answer"), (Mode.AUTO, "")]
 
 
@@ -243,7 +243,7 @@ def test_a_plant_is_handed_back_once(make_loop: Callable[..., ControlLoop]) -> N
     loop = make_loop(line, fallback=Fallback(1.0, hand_back=True), recover_after=1)
     line.away = line.deaf = True
     modes: list[Any] = []
-    loop.run(4, observe=lambda s, c: modes.append((c.mode, c.reason.partition(":")[0])))
+    loop.run(4, observe=lambda s, c: modes.append((c.mode, c.fault.partition(":")[0])))
     assert modes[-1] == (Mode.HOLD, "the plant cannot be handed back")
     line.deaf = False
     loop.run(1)

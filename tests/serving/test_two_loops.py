@@ -26,7 +26,7 @@ from loopwright.serving.opcua.nameplates import Identity
 from loopwright.serving.opcua.node_lease import SCANS, NodeLease
 from loopwright.serving.station import station
 from loopwright.serving.station.control import Control, ask, door
-from loopwright.serving.station.housekeeping import Tending
+from loopwright.serving.station.housekeeping import PeriodicTask
 from loopwright.serving.station.mv_lock import Lease, Locks, address_of
 
 SPEED = 2.0  # periods of .25 s: a loop counts as gone after five without a renewal
@@ -64,7 +64,7 @@ def lease(plant: Plant, text: str | None = None) -> Any:
 
 def mode(loop: RunningLoop) -> tuple[Mode, str]:
     assert loop.station.snapshot is not None
-    return loop.station.snapshot.command.mode, loop.station.snapshot.command.reason
+    return loop.station.snapshot.command.mode, loop.station.snapshot.command.fault
 
 
 def test_the_second_loop_holds_until_the_first_is_gone(
@@ -72,22 +72,22 @@ def test_the_second_loop_holds_until_the_first_is_gone(
 ) -> None:
     """Neither is told of a lease: both find the plant's own."""
     first = machine(tmp_path / "a", plant, "AUTO", monkeypatch, nodes="")
-    assert within(20, lambda: first.station.endpoint.lease.held and mode(first)[0] is Mode.AUTO)
+    assert within(20, lambda: first.station.endpoint.sender.lease.held and mode(first)[0] is Mode.AUTO)
     second = machine(tmp_path / "b", plant, "SHADOW", monkeypatch, nodes="")
     try:
         # A shadow beside it needs no lease and takes none.
         assert within(10, lambda: second.station.scans > 10)
-        owner = first.station.endpoint.lease.owner
+        owner = first.station.endpoint.sender.lease.owner
         assert within(20, lambda: lease(plant).startswith(owner))  # one that lost the plant for a moment takes it anew
         second.does("mode", "AUTO")
         refused = f"the plant is controlled by {owner}"
-        assert within(20, lambda: any(refused in c.reason and c.mode is Mode.HOLD for c in second.commands))
+        assert within(20, lambda: any(refused in c.fault and c.mode is Mode.HOLD for c in second.commands))
         before = len(plant.actuator())
         assert within(20, lambda: len(plant.actuator()) > before + 10)
-        assert not second.station.endpoint.lease.held
+        assert not second.station.endpoint.sender.lease.held
         assert within(20, lambda: mode(first)[0] is Mode.AUTO)  # a busy machine may hold it for a moment
         first.end()
-        assert within(30, lambda: second.station.endpoint.lease.held and mode(second)[0] is Mode.AUTO)
+        assert within(30, lambda: second.station.endpoint.sender.lease.held and mode(second)[0] is Mode.AUTO)
         second.does("mode", "SHADOW")
         assert within(20, lambda: lease(plant) == "")
     finally:
@@ -141,11 +141,11 @@ def test_a_lease_of_a_loop_that_was_killed_is_taken_over(
     lease(plant, "elsewhere:17:abc 41")
     loop = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
     try:
-        assert within(30, lambda: loop.station.endpoint.lease.held and mode(loop)[0] is Mode.AUTO)
+        assert within(30, lambda: loop.station.endpoint.sender.lease.held and mode(loop)[0] is Mode.AUTO)
         # Somebody else takes it: the next reading finds that out, and nothing is written any more.
         lease(plant, "elsewhere:18:def 1")
         refused = "the plant is controlled by elsewhere:18:def"
-        assert within(20, lambda: any(refused in c.reason and c.mode is Mode.HOLD for c in loop.commands))
+        assert within(20, lambda: any(refused in c.fault and c.mode is Mode.HOLD for c in loop.commands))
     finally:
         loop.end()
 
@@ -242,14 +242,14 @@ def test_tending_goes_on_whatever_it_meets() -> None:
         if len(calls) in {2, 3}:
             raise LoopError("another loop has it")
 
-    tending = Tending(act, said.append, every_s=0.001)
+    tending = PeriodicTask(act, said.append, every_s=0.001)
     assert within(20, lambda: len(calls) > 5)
     tending.close()
     assert said == ["another loop has it", ""]
 
 
 def test_a_station_tends_its_locks_and_its_door(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(station, "Tending", lambda act, trouble: Tending(act, trouble, every_s=0.05))
+    monkeypatch.setattr(station, "PeriodicTask", lambda act, trouble: PeriodicTask(act, trouble, every_s=0.05))
     loop = machine(tmp_path / "a", plant, "SHADOW", monkeypatch)
     folder, journal = tmp_path / "a", loop.settings.journal.file
     try:
@@ -269,10 +269,10 @@ def test_a_loop_that_learns_that_another_one_has_its_lock_writes_no_more(
 ) -> None:
     gone = Event()
 
-    def tending(act: Callable[[], None], trouble: Callable[[str], None]) -> Tending:
-        return Tending(lambda: act() if gone.is_set() else None, trouble, every_s=0.05)
+    def tending(act: Callable[[], None], trouble: Callable[[str], None]) -> PeriodicTask:
+        return PeriodicTask(lambda: act() if gone.is_set() else None, trouble, every_s=0.05)
 
-    monkeypatch.setattr(station, "Tending", tending)
+    monkeypatch.setattr(station, "PeriodicTask", tending)
     loop = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
     node = loop.settings.nodes.points("mv")["T_j"].node
     try:

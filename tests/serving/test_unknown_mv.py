@@ -33,7 +33,7 @@ def test_nothing_is_written_before_a_good_sample_with_a_read_back(mode: Mode, pi
         command = loop.miss("no route") if blind is None else loop.scan(blind)
         assert not command.writes
         assert np.isnan(command.mv).all()
-        assert command.reason
+        assert command.fault
     command = loop.scan(sample())
     assert command.writes
     assert command.mv.tolist() == [STANDS]
@@ -52,7 +52,7 @@ def test_a_good_first_sample_begins_at_once_from_the_read_back(pi_file: Path) ->
 
 def test_a_missing_read_back_is_named_until_there_is_one(pi_file: Path) -> None:
     loop = loop_on(pi_file)
-    assert "there is no read-back" in loop.scan(sample(mv=None)).reason
+    assert "there is no read-back" in loop.scan(sample(mv=None)).fault
     assert loop.scan(sample()).mv.tolist() == [STANDS]
     assert loop.scan(sample(mv=None)).writes  # from now on the last command counts as applied
 

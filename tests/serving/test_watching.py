@@ -16,7 +16,7 @@ from processes import within
 from loopwright.serving import Command, Controller, Mode
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.monitor import Monitor, Verdict
-from loopwright.serving.station.recorder import Recorder, Watching
+from loopwright.serving.station.recorder import MonitorRunner, Recorder
 from loopwright.serving.station.station import Station
 
 FILE = Path(__file__).parents[2] / "artifacts" / "ph_neutralization" / "pid.onnx"
@@ -26,7 +26,7 @@ def scan_of(controller: Controller, k: int, time_s: float) -> tuple[None, Comman
     """One scan of a loop that holds."""
     m = controller.manifest
     mv, sp = np.array([s.middle for s in m.mv]), np.array([s.middle for s in m.sp])
-    return None, Command(k, Mode.HOLD, sp, mv, None, None, reason="lost"), time_s
+    return None, Command(k, Mode.HOLD, sp, mv, None, None, fault="lost"), time_s
 
 
 @pytest.fixture
@@ -56,27 +56,27 @@ def test_a_forged_memory_in_the_journal_is_told_once_and_the_monitor_learns_anew
     }  # fmt: skip
     recorder.journal.keep(f"monitor {controller.sha256}", forged[forgery])
     assert told(recorder) == []
-    watching = Watching(controller, recorder)
+    watching = MonitorRunner(controller, recorder)
     (said,) = told(recorder)
     assert "learns anew" in said
     watching.seen(controller, scan_of(controller, 0, 1e9))
     assert watching.monitor.verdicts()
     watching.keep()
     assert len(told(recorder)) == 1
-    Watching(controller, recorder)  # the next start finds what this one kept
+    MonitorRunner(controller, recorder)  # the next start finds what this one kept
     assert len(told(recorder)) == 1
 
 
 def test_a_monitor_whose_numbers_are_none_is_not_kept_and_learns_anew(recorder: Recorder) -> None:
     controller = Controller(FILE)
-    watching = Watching(controller, recorder)
+    watching = MonitorRunner(controller, recorder)
     watching.keep()
     watching.monitor.hold.value = float("nan")
     watching.keep()
     (said,) = told(recorder)
     assert "not finite" in said
     assert watching.monitor.hold.value == 0.0
-    Watching(controller, recorder)
+    MonitorRunner(controller, recorder)
     assert len(told(recorder)) == 1
 
 
@@ -84,7 +84,7 @@ def test_what_fails_in_watching_is_told_once_and_raises_nothing(
     recorder: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     controller = Controller(FILE)
-    watching = Watching(controller, recorder)
+    watching = MonitorRunner(controller, recorder)
 
     def broken(*_: object) -> None:
         raise OverflowError("year 31690708 is out of range")
@@ -138,7 +138,7 @@ def test_an_alarm_is_written_down_within_one_look_whatever_the_clock_does(
     recorder = SimpleNamespace(journal=journal, note=lambda *words, **_: notes.append(words[2]))
     controller = Controller(FILE)
     m = controller.manifest
-    watching = Watching(controller, cast(Recorder, recorder))
+    watching = MonitorRunner(controller, cast(Recorder, recorder))
 
     def scan(k: int, time_s: float) -> None:
         watching.seen(controller, scan_of(controller, k, time_s))

@@ -14,8 +14,7 @@ from identified_models import made_signals
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.plants.simulator import Array, Simulator
-from loopwright.pipeline.tuning.development import DevelopmentLoops
-from loopwright.pipeline.tuning.loop_search import CALM_GAIN, calm, searched, simc
+from loopwright.pipeline.tuning.loop_search import CALM_GAIN, DevelopmentLoops, calm, searched, simc
 from loopwright.pipeline.tuning.pairing import pairings, relative_gains
 from loopwright.pipeline.tuning.responses import FirstOrder, StepResponses
 from loopwright.pipeline.tuning.rules import PidSettings

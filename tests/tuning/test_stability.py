@@ -8,14 +8,17 @@ import pytest
 from loopwright.pipeline.cases.henson_seborg_cstr.plant import HensonSeborgCstr
 from loopwright.pipeline.errors import LawError, PlantError
 from loopwright.pipeline.laws.pid.pid import PID
-from loopwright.pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
 from loopwright.pipeline.tuning.rules import PidSettings, sampled_loop
 from loopwright.pipeline.tuning.stability import (
     LARGEST_MARGIN,
     FrozenLoops,
+    Recovery,
+    Starts,
     feedback,
+    other_rests,
     pairwise_contraction,
     quadratic_contraction,
+    recover,
     spectral_radius,
 )
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from loopwright.pipeline.errors import LawError, PlantError
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.steady import Linearization
-from loopwright.pipeline.tuning.development import DevelopmentLoops
+from loopwright.pipeline.tuning.loop_search import DevelopmentLoops
 from loopwright.pipeline.tuning.reduction import LagWithDeadTime, minimal
 from loopwright.pipeline.tuning.rules import (
     AllPole,

@@ -19,7 +19,6 @@ from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.pictures.drawing import png
 from loopwright.pipeline.pictures.loop_picture import fewer_colours
 from loopwright.pipeline.workbench import (
-    CELL_DPI,
     Identification,
     PlantData,
     design,
@@ -29,6 +28,7 @@ from loopwright.pipeline.workbench import (
     screen,
     simulate,
 )
+from loopwright.pipeline.workbench.closed_loop import CELL_DPI
 from loopwright.serving.controller import Controller
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_plant" / "make_export.py"

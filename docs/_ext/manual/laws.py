@@ -84,7 +84,7 @@ def _needs(law: type[ControlLaw]) -> str:
 
 
 def _transfer(law: type[ControlLaw]) -> str:
-    if law.incremental:
+    if law.velocity_form:
         return "adds a move to the applied MV: bumpless by itself"
     return "computes the MV anew: the loop's transfer limits the first moves"
 

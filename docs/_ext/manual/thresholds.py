@@ -75,9 +75,10 @@ def thresholds() -> str:
 
 
 def _remarks(source: str) -> dict[int, str]:
-    """Line -> the comment on it."""
+    """Line -> the comment on it; a title after dashes begins a section, and is no reason for a number."""
     found = tokenize.generate_tokens(io.StringIO(source).readline)
-    return {t.start[0]: t.string.lstrip("# ") for t in found if t.type == tokenize.COMMENT}
+    comments = {t.start[0]: t.string.lstrip("# ") for t in found if t.type == tokenize.COMMENT}
+    return {line: text for line, text in comments.items() if not text.startswith("---")}
 
 
 def _number(value: ast.expr) -> bool:

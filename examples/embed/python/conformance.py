@@ -70,7 +70,7 @@ for row in vectors["scans"]:
     else:
         sample = {name: numbers(row["sample"][name]) for name in ("pv", "mv_applied", "dv")}
         command = loop.scan(Sample(**sample, age_s=float.fromhex(row["sample"]["age_s"])))
-    found = {"mode": str(command.mode), "fault": bool(command.reason)}
+    found = {"mode": str(command.mode), "fault": bool(command.fault)}
     wrong += any(found[name] != row[name] for name in found) or command.writes == (row["mv"] is None)
     found["mv"] = answer("chained", "mv", command.mv, row["mv"]) if command.writes else None
     scans.append(found)

@@ -23,7 +23,7 @@ class Plant:
 
 
 def show(sample, command):
-    print(command.scan, command.mode, *(command.mv.tolist() if command.writes else "-"), command.reason)
+    print(command.scan, command.mode, *(command.mv.tolist() if command.writes else "-"), command.fault)
 
 
 if not sys.argv[1:]:

@@ -10,8 +10,14 @@ import numpy as np
 from loopwright.pipeline.cases.batch_reactor.case import CALMED, PLAIN
 from loopwright.pipeline.evaluation.case import Curve, PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
+from loopwright.pipeline.evaluation.verdicts import (
+    Check,
+    CheckOutcome,
+    Claims,
+    faster_than_nmpc,
+    plain_reason,
+    step_within,
+)
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.words import law_name
 

@@ -11,8 +11,14 @@ from scipy import optimize
 from loopwright.pipeline.cases.henson_seborg_cstr.case import ALONE, AUTO, FAST, GAINS, PID_1, TUNED
 from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
+from loopwright.pipeline.evaluation.verdicts import (
+    Check,
+    CheckOutcome,
+    Claims,
+    faster_than_nmpc,
+    plain_reason,
+    step_within,
+)
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.steady import Linearization

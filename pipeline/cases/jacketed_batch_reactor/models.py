@@ -7,8 +7,8 @@ from typing import ClassVar
 
 from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import CENTRES, FuzzyBatchReactor
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy_part import figures
+from loopwright.pipeline.models.hybrid_fuzzy import HybridFuzzy
+from loopwright.pipeline.models.hybrid_fuzzy_part import figures
 from loopwright.pipeline.models.part import Learnt, Part, Source
 
 

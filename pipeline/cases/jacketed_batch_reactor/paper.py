@@ -30,8 +30,14 @@ from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_models import (
 from loopwright.pipeline.cases.jacketed_batch_reactor.fuzzy_plant import MODES, FuzzyBatchReactor
 from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.evidence import Evidence
-from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
+from loopwright.pipeline.evaluation.verdicts import (
+    Check,
+    CheckOutcome,
+    Claims,
+    faster_than_nmpc,
+    plain_reason,
+    step_within,
+)
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.words import law_name
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.lagged.lagged import NNARX
-from loopwright.pipeline.models.lagged.one_step import ESTIMATE_FORGETTING, OneStep, compare_one_step
+from loopwright.pipeline.models.lagged.nnarx_part import ESTIMATE_FORGETTING, OneStep, compare_one_step
 from loopwright.pipeline.models.part import Learnt, Part, Source
 from loopwright.pipeline.models.training.network_parts import trainer_of
 from loopwright.pipeline.models.training.objectives import Samples

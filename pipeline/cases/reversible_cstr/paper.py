@@ -15,9 +15,8 @@ from loopwright.pipeline.evaluation.case import Curve
 from loopwright.pipeline.evaluation.closed_loop import overshoots
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import Array
-from loopwright.pipeline.evaluation.timing import step_within
-from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
-from loopwright.pipeline.pictures.free_runs import free_run_fit_at_least, one_step_says_little
+from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason, step_within
+from loopwright.pipeline.pictures.model_pictures import free_run_fit_at_least, one_step_says_little
 from loopwright.pipeline.pictures.numbers import number
 
 SET = "plant_network"

@@ -29,7 +29,7 @@ from loopwright.pipeline.pictures.drawing import (
     symbol,
     time_axis,
 )
-from loopwright.pipeline.pictures.free_runs import free_run_picture
+from loopwright.pipeline.pictures.model_pictures import free_run_picture
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.words import law_name
 from loopwright.pipeline.tuning.reference_model import CLASSIC, ORDERS, ReferenceModel

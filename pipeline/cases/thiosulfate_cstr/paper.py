@@ -13,8 +13,14 @@ import numpy as np
 from loopwright.pipeline.cases.thiosulfate_cstr.case import TJ
 from loopwright.pipeline.evaluation.case import PaperFigure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
-from loopwright.pipeline.evaluation.timing import faster_than_nmpc, step_within
-from loopwright.pipeline.evaluation.verdicts import Check, CheckOutcome, Claims, plain_reason
+from loopwright.pipeline.evaluation.verdicts import (
+    Check,
+    CheckOutcome,
+    Claims,
+    faster_than_nmpc,
+    plain_reason,
+    step_within,
+)
 from loopwright.pipeline.plants.steady import Linearization
 
 # (C_A [mol/l], T [K]) at Tj = 250 K

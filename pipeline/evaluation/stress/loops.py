@@ -20,7 +20,7 @@ from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.simulate import Trajectory
 from loopwright.serving.controller import Controller
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.rows import ControllerRows
+from loopwright.serving.vectorized_controller import VectorizedController
 
 AdvanceRows = Callable[[Array, Array, Array, Array], Array]
 """``advance(x (n, n_x), mv (n, n_mv), dv (n, n_dv), p (n, n_p)) -> x (n, n_x)`` one period later."""
@@ -156,7 +156,7 @@ class Stress:
         measured = dv + np.stack([d.dv_deviation(plant) for d in draws], axis=1)
         known = [t.parameters(plant) for t in tests]
         mv0, x = np.stack([t.mv0 for t in tests]), np.stack([t.x0 for t in tests])
-        law, advance = ControllerRows(self.controller, n), advance_rows(plant, n)
+        law, advance = VectorizedController(self.controller, n), advance_rows(plant, n)
         actuators = Actuators(plant.mv_signals, [d.fault for d in draws], mv0, [d.late for d in draws])
         state, readback, broke = law.cold_state(), mv0.copy(), np.zeros(n, dtype=bool)
         pvs, mvs = np.empty((samples, n, noise.shape[2])), np.empty((samples, *mv0.shape))

@@ -32,7 +32,7 @@ class Spread:
 
 
 @dataclass(frozen=True)
-class Met:
+class RequirementShare:
     """A requirement of the case, and the share of the loops over its test that met it."""
 
     requirement: Requirement
@@ -41,7 +41,7 @@ class Met:
 
 
 @dataclass(frozen=True)
-class Growth:
+class ErrorGrowth:
     """How the relative error grows along one drawn quantity: its middle, median and 90 % value of each share."""
 
     name: str
@@ -115,7 +115,7 @@ class Summary:
         )
         return Spread(metric, test, len(values), found)
 
-    def requirements(self) -> list[Met]:
+    def requirements(self) -> list[RequirementShare]:
         """The case's requirements of a test that count for this controller, without those that need a bound."""
         found = []
         for need in self.case.requirements:
@@ -125,7 +125,7 @@ class Summary:
             values = figures_of(self.outcomes, need.metric)[places]
             failed = np.array([self.outcomes[i].failed for i in places])
             met = (values >= need.low) & (values <= need.high) & ~failed
-            found.append(Met(need, len(places), float(np.mean(met))))
+            found.append(RequirementShare(need, len(places), float(np.mean(met))))
         return found
 
     def worst(self, count: int = WORST) -> list[int]:
@@ -135,7 +135,7 @@ class Summary:
         )
         return order[:count]
 
-    def growths(self) -> list[Growth]:
+    def growths(self) -> list[ErrorGrowth]:
         """How the error grows along each drawn quantity, the strongest first."""
         rows = [draw.quantities() for draw in self.draws]
         names = dict.fromkeys(name for row in rows for name in row)
@@ -143,7 +143,7 @@ class Summary:
         found.append(self._by_kind())
         return sorted((g for g in found if g is not None), key=lambda g: -g.size)
 
-    def _growth(self, name: str, values: Array) -> Growth | None:
+    def _growth(self, name: str, values: Array) -> ErrorGrowth | None:
         known = np.flatnonzero(~np.isnan(values))
         distinct = np.unique(values[known])
         if len(distinct) < 2 or len(known) < 2 * LEAST_LOOPS:
@@ -155,7 +155,7 @@ class Summary:
             groups = list(np.array_split(known[np.argsort(values[known], kind="stable")], shares))
         return _grown(name, tuple(float(np.median(values[g])) for g in groups), [self.relative[g] for g in groups])
 
-    def _by_kind(self) -> Growth | None:
+    def _by_kind(self) -> ErrorGrowth | None:
         kinds = np.array([NO_FAULT if d.fault is None else d.fault.kind for d in self.draws])
         names = [k for k in dict.fromkeys(sorted(kinds.tolist())) if np.sum(kinds == k) >= LEAST_LOOPS]
         if len(names) < 2:
@@ -163,9 +163,9 @@ class Summary:
         return _grown("fault of the actuator", tuple(names), [self.relative[kinds == k] for k in names])
 
 
-def _grown(name: str, at: tuple[float, ...] | tuple[str, ...], groups: Sequence[Array]) -> Growth:
+def _grown(name: str, at: tuple[float, ...] | tuple[str, ...], groups: Sequence[Array]) -> ErrorGrowth:
     median, high = (tuple(float(np.quantile(g, q, method="lower")) for g in groups) for q in (0.5, 0.9))
-    return Growth(name, at, median, high)
+    return ErrorGrowth(name, at, median, high)
 
 
 def table(draws: Sequence[Draw], outcomes: Sequence[StressOutcome]) -> Mapping[str, list[object]]:

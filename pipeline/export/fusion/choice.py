@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from loopwright.pipeline.export.fusion.affine import AffineValue
-from loopwright.pipeline.export.fusion.items import Items
+from loopwright.pipeline.export.fusion.items import Items, SelectionPool
 from loopwright.pipeline.export.fusion.plan import Account, FormChoice, Item, Member
-from loopwright.pipeline.export.fusion.pools import SelectionPool
 
 PREFERENCES = (
     ("recipe", "selection", "elementwise", "segments", "increment", "row", "group"),

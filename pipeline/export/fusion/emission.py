@@ -11,7 +11,7 @@ import onnx
 from onnx import helper, numpy_helper
 
 from loopwright.pipeline.export.fusion.affine import Array, Attributes, Shape, numbers
-from loopwright.pipeline.export.fusion.items import Items
+from loopwright.pipeline.export.fusion.items import Group, Items, SelectionPool
 from loopwright.pipeline.export.fusion.plan import (
     FormChoice,
     GraphInput,
@@ -22,7 +22,6 @@ from loopwright.pipeline.export.fusion.plan import (
     Output,
     Several,
 )
-from loopwright.pipeline.export.fusion.pools import Group, SelectionPool
 
 Outputs: TypeAlias = Sequence[tuple[str, Input]]
 """The graph's outputs by their names."""

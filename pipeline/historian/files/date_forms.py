@@ -14,7 +14,7 @@ from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.metrics import Array
 
 # ------------------------------------ counts of days, as 45355.25 of a spreadsheet, told from seconds since some start
-DAY_S = 86_400.0
+DAY_S = 86_400.0  # [s] of a day
 
 
 @dataclass(frozen=True, slots=True)

@@ -197,7 +197,7 @@ def _by_size(cells: Sequence[str], sign: str) -> str:
 
 
 # ----------------------------------------------------------------------------------------------------- the whole of it
-SAMPLE_BYTES = 1 << 18
+SAMPLE_BYTES = 1 << 18  # bytes at the start of a file by which its dialect is recognized; read at once, too
 SAMPLE_LINES = 200  # lines by which separators and decimals are recognized
 SEPARATORS = ("\t", ";", "|", ",")  # a comma last: it may be the decimal sign
 LONGEST_HEADER = 6  # lines of one header, with line breaks in quoted names

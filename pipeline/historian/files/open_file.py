@@ -142,7 +142,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 # ------------------------------------------------------------------------------------------------------------ any file
-BLOCK_BYTES = 1 << 24
+BLOCK_BYTES = 1 << 24  # bytes of a text that are parsed at once
 BLOCK_ROWS = 1 << 17  # rows that are read at once
 SPREAD_CELLS = 1_000  # cells of a block
 PARQUET = {".parquet", ".pq"}

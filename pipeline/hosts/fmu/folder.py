@@ -1,8 +1,9 @@
-"""The content of a controller FMU and its variables, as a folder and as the zip file that tools read."""
+"""The content of a controller FMU and its variables, as a folder and a zip file, and its check by the controller."""
 
 from __future__ import annotations
 
 import html
+import importlib
 import json
 import re
 import shutil
@@ -12,9 +13,13 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
+import numpy as np
+
 from loopwright.pipeline.errors import HostError
 from loopwright.pipeline.hosts.fmu.compiling import HOSTS, SOURCES, Toolchain
-from loopwright.pipeline.plants.fmu.description import fmpy
+from loopwright.pipeline.plants.fmu.description import described, fmpy
+from loopwright.pipeline.plants.fmu.instance import Instance
+from loopwright.serving.conformance.steps import answered
 from loopwright.serving.controller import Controller
 from loopwright.serving.controller_file import file_digest
 from loopwright.serving.manifest import Manifest, Signal
@@ -159,7 +164,7 @@ def _written(root: Element) -> bytes:
 
 # ----------------------------------------------------------------------------------------------- the content of an FMU
 MADE = (1980, 1, 1, 0, 0, 0)  # the time of every entry: the same controller gives the same bytes
-QUICK = 1  # compression: onnxruntime's library is nearly all of the file, and 9 saves a tenth of it
+ZIP_LEVEL = 1  # compression: onnxruntime's library is nearly all of the file, and 9 saves a tenth of it
 LICENCES = ("LICENSE", "ThirdPartyNotices.txt")
 
 
@@ -206,7 +211,7 @@ def pack(folder: Path, to: Path) -> None:
                 entry = zipfile.ZipInfo(path.relative_to(folder).as_posix(), MADE)
                 entry.compress_type = zipfile.ZIP_DEFLATED
                 entry.external_attr = (0o755 if path.name.startswith("lib") or path.suffix == ".so" else 0o644) << 16
-                made.writestr(entry, path.read_bytes(), compresslevel=QUICK)
+                made.writestr(entry, path.read_bytes(), compresslevel=ZIP_LEVEL)
 
 
 def _write_controller(controller: Controller, resources: Path) -> None:
@@ -293,3 +298,45 @@ def in_xml(text: str) -> str:
     if NOT_IN_XML.search(text):
         raise HostError(f"the name {text!r} has a character that an FMU's description, which is XML, cannot hold")
     return " ".join(text.split())
+
+
+# ------------------------------- the FMU beside its controller: the same bits in the conformance kit's steps, or no FMU
+def check(controller: Controller, fmu: Path, folder: Path) -> int:
+    """Play the kit's steps through the FMU, which lies unpacked in ``folder``; how many were compared.
+
+    A refused step must hold the last MV and info and leave the state as it was, which the steps after it show.
+    Raises HostError where a number differs by a bit, PlantError where the FMU cannot be loaded or refuses a call.
+    """
+    rows, period = variables_of(controller.manifest), controller.manifest.period_s
+    mv, info = _references(rows, "mv"), _references(rows, "info")
+    groups = [name for name in controller.manifest.inputs if name != "state"]
+    given_to = [reference for name in groups for reference in _references(rows, name)]
+    instance, expected, k = Instance(described(fmu), folder), np.zeros(0), 0
+    steps = answered(controller)
+    for number, answer in enumerate(steps):
+        if answer.given.cold:
+            instance.begin()
+            k = 0
+        values = np.concatenate([answer.given.inputs[name] for name in groups])
+        instance.step(given_to, values, k * period, period)
+        k += 1
+        if answer.step is not None:
+            expected = np.concatenate([answer.step.mv, answer.step.info])
+        found = instance.get([*mv, *info])
+        if found.tobytes() != expected.tobytes():
+            raise HostError(
+                f"the FMU differs from {controller.path} in step {number} of the conformance kit: "
+                f"{found.tolist()} instead of {expected.tolist()}; nothing is written"
+            )
+    return len(steps)
+
+
+def problems(fmu: Path) -> list[str]:
+    """Faults of an FMU by fmpy: its XML against FMI's schema, names, units, the structure of its outputs."""
+    fmpy()
+    validation = importlib.import_module("fmpy.validation")
+    return list(validation.validate_fmu(str(fmu)))
+
+
+def _references(rows: list[ScalarVariable], group: str) -> list[int]:
+    return [row.reference for row in rows if row.group == group]

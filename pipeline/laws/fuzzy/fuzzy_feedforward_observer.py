@@ -10,7 +10,7 @@ from torch import Tensor
 
 from loopwright.pipeline.laws.base import Stepped, hold_numbers
 from loopwright.pipeline.laws.fuzzy.fuzzy_law import FuzzyLaw, FuzzyParams, require_shares
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
+from loopwright.pipeline.models.hybrid_fuzzy import HybridFuzzy, JacketAffine
 from loopwright.pipeline.plants.simulator import Signals
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw, hold_numbers
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import HybridFuzzy, JacketAffine
+from loopwright.pipeline.models.hybrid_fuzzy import HybridFuzzy, JacketAffine
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 
 TIE = 1e-9  # [degC] what two modes may differ by through rounding alone

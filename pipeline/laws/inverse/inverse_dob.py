@@ -14,14 +14,15 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import (
     Analysis,
     ControlLaw,
+    OfRange,
     Stepped,
     hold_numbers,
+    in_units,
     require_kind,
     require_part,
     require_single_loop,
 )
 from loopwright.pipeline.laws.inverse.from_identified import LONGEST_INVERSE_HORIZON, HorizonChoice, learnt_parts
-from loopwright.pipeline.laws.scaled_defaults import OfRange, in_units
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.static.mlp import MLP

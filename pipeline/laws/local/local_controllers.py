@@ -14,13 +14,27 @@ from torch import Tensor
 
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.actuator import never_given, stood_still
-from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, hold_numbers, require_single_loop
-from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.laws.base import (
+    Analysis,
+    ControlLaw,
+    Stepped,
+    hold_numbers,
+    never_given,
+    require_single_loop,
+    stood_still,
+)
+from loopwright.pipeline.models.local_models import LocalModels
 from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
-from loopwright.pipeline.tuning.recovery import Recovery, Starts, other_rests, recover
-from loopwright.pipeline.tuning.stability import FrozenLoops, pairwise_contraction, spectral_radius
+from loopwright.pipeline.tuning.stability import (
+    FrozenLoops,
+    Recovery,
+    Starts,
+    other_rests,
+    pairwise_contraction,
+    recover,
+    spectral_radius,
+)
 
 LOCAL_BATCH = 500  # loops that run side by side in one piece
 SAME_STATE = 1e-3  # relative difference of two states that count as one
@@ -228,7 +242,7 @@ class LocalControllers(ControlLaw):
     gains around one integrator is not in the paper.
     """
 
-    incremental = True
+    velocity_form = True
     parts: ClassVar[Mapping[str, str]] = {"local_models": "kind local_models"}
 
     table: Tensor  # (m, 5): Kp_i, h Ki_i, Kd_i/h, a_i, u_i

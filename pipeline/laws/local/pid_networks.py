@@ -12,7 +12,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import require_kind
 from loopwright.pipeline.laws.local.local_controllers import BlendedParams, LocalControllers, LocalPid
 from loopwright.pipeline.models.base import Model
-from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.models.local_models import LocalModels
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning.rules import AllPole

@@ -13,9 +13,22 @@ import torch
 from torch import Tensor
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.actuator import Rates, never_given, stood_still
-from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_single_loop
-from loopwright.pipeline.laws.pid.tuned import by_simulation, given_pairs, linearization, require_numbers, tuned
+from loopwright.pipeline.laws.base import (
+    Analysis,
+    ControlLaw,
+    Rates,
+    Stepped,
+    never_given,
+    require_single_loop,
+    stood_still,
+)
+from loopwright.pipeline.laws.pid.tuned import (
+    by_simulation,
+    given_pairs,
+    linearization,
+    require_numbers,
+    tuned,
+)
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.equations import equations
 from loopwright.pipeline.plants.simulator import Signals, Simulator
@@ -55,7 +68,7 @@ class PID(ControlLaw):
 
     name: ClassVar[str] = "pid"
     title: ClassVar[str] = "PID"
-    incremental: ClassVar[bool] = True
+    velocity_form: ClassVar[bool] = True
     one_loop: ClassVar[bool] = False
 
     @dataclass(frozen=True, slots=True)

@@ -15,8 +15,7 @@ from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning import rules
-from loopwright.pipeline.tuning.development import DevelopmentLoops
-from loopwright.pipeline.tuning.loop_search import Loops, calm, searched
+from loopwright.pipeline.tuning.loop_search import DevelopmentLoops, Loops, calm, searched
 from loopwright.pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, gains_of, pairings
 from loopwright.pipeline.tuning.reduction import LagWithDeadTime, start_lags
 from loopwright.pipeline.tuning.responses import StepResponses

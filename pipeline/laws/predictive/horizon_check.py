@@ -118,7 +118,7 @@ def refuse_unstable(model: Identified) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class AnswerTimes:
     """Samples after a step of an MV: the first answer of the CV that answers last, and the settling of the answers."""
 
     first: int  # STEP_SAMPLES + 1 where none is there by then
@@ -126,7 +126,7 @@ class Sight:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, model: Identified, mv_of: Callable[[Tensor], Tensor], n_cv: int) -> Sight:
+    def of(cls, model: Identified, mv_of: Callable[[Tensor], Tensor], n_cv: int) -> AnswerTimes:
         """From the model's step responses; ``mv_of`` as in ``horizon_for``."""
         responses = step_responses(model, mv_of)
         settling = settling_times(responses)

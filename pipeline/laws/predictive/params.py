@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.actuator import Rates
+from loopwright.pipeline.laws.base import Rates
 from loopwright.pipeline.laws.predictive.disturbance_model import Where
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Array, Signals

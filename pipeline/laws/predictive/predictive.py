@@ -12,7 +12,7 @@ from torch import Tensor
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
 from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, held_rest, loads_of
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
-from loopwright.pipeline.laws.predictive.horizon_check import Sight, horizon_for, mvs_of, refuse_unstable
+from loopwright.pipeline.laws.predictive.horizon_check import AnswerTimes, horizon_for, mvs_of, refuse_unstable
 from loopwright.pipeline.laws.predictive.observer import Noises, Observer, StateEstimate, load_variance
 from loopwright.pipeline.laws.predictive.params import (
     PredictiveParams,
@@ -21,8 +21,7 @@ from loopwright.pipeline.laws.predictive.params import (
     refuse_discrete,
     weights_of,
 )
-from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
-from loopwright.pipeline.laws.predictive.set_points import PRICE, SetPointCourse, SoftLimits
+from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Cost, Planner, SetPointCourse, SoftLimits
 from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, calmest, in_words, tuned
 from loopwright.pipeline.laws.predictive.tuning_loops import TuningLoops
 from loopwright.pipeline.models.base import Model
@@ -191,7 +190,7 @@ class Predictive(ControlLaw):
         refuse_discrete(signals)
         model = require_kind(models, Identified, cls.name, "")
         law = cls(signals, model, params)
-        sight = Sight.of(model, mvs_of(model, law.mv_middle, law.mv_half), len(signals.sp))
+        sight = AnswerTimes.of(model, mvs_of(model, law.mv_middle, law.mv_half), len(signals.sp))
         sight.require(law.moves.horizon)
         if params.tuning == "search":
             law = law._searched(model, params)

@@ -17,8 +17,7 @@ from loopwright.pipeline.laws.predictive.disturbance_model import REST_SAMPLES
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.identified import StateEquation, shift_rows
 from loopwright.pipeline.plants.noise import coloured, deviation
-from loopwright.pipeline.plants.perturbed import likely_error
-from loopwright.pipeline.plants.simulator import Array, Signals
+from loopwright.pipeline.plants.simulator import Array, Signals, likely_error
 
 M = TypeVar("M", bound=nn.Module)
 

@@ -1,4 +1,4 @@
-"""Networks trained through time so that the loop follows a reference model: incremental, and as printed."""
+"""Networks trained through time so that the loop follows a reference model: in velocity form, and as printed."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ class ModelReference(NetworkLaw):
     sensitivities and Levenberg-Marquardt, over random set points, noise and loads.
 
     Source: [reference_ann, section "ANN Controller Design"], whose network has two errors
-    as its only inputs and no memory (``ModelReferenceTwoError``); the incremental form is ours.
+    as its only inputs and no memory (``ModelReferenceTwoError``); the velocity form is ours.
     """
 
     name: ClassVar[str] = "model_reference"
     title: ClassVar[str] = "Model-reference network"
-    incremental: ClassVar[bool] = True
+    velocity_form: ClassVar[bool] = True
 
     Network: ClassVar[type[Any]] = IncrementalNetwork
 

@@ -28,7 +28,7 @@ class PiReference(ReferenceLaw):
 
     name: ClassVar[str] = "pi_reference"
     title: ClassVar[str] = "PI on the reference model"
-    incremental: ClassVar[bool] = True
+    velocity_form: ClassVar[bool] = True
 
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Params(ReferenceParams):

@@ -11,8 +11,7 @@ import torch
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import Analysis, require_kind, require_single_loop
-from loopwright.pipeline.laws.reference.reference_law import ReferenceParams
-from loopwright.pipeline.laws.reference.reference_loops import Loops, PlantNetwork, Training
+from loopwright.pipeline.laws.reference.reference_law import Loops, PlantNetwork, ReferenceParams, Training
 from loopwright.pipeline.laws.reference.reference_networks import Trainable
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.state_space import StateSpace

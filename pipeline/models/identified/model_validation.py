@@ -13,13 +13,13 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loopwright.pipeline.config.known import CONTRADICTION_SDS
 from loopwright.pipeline.historian.answers import DirectModel
 from loopwright.pipeline.historian.feedback import follows
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_start import high_order_arx
+from loopwright.pipeline.models.identified.parameter_uncertainty import weighted_interval
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.structure import (
     SMALL_CELL_ANSWER,
@@ -42,7 +42,6 @@ USED = 0.25  # of a PV's strongest answer to an MV over its range: a weaker one 
 COMPARED_ROWS, BEGINNING_ROWS = 60, 240  # rows after a step: of the comparison, and in which an answer begins
 LEAST_LAGS = 40  # of one-step predictions
 ANSWER_BEGUN, HALF_ANSWER, MOST_ANSWER = 0.02, 0.5, 0.9  # of an answer
-LEFT_OUT = 0.05  # of the models' weight, at either end of their answers: one poor model of many vetoes nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +157,9 @@ def proven_answers(
     weights = np.ones(len(unit)) if weights is None else weights
     middle = np.median(unit, axis=0)
     reach = np.abs(middle[:n_mv]).max(axis=1)  # (n_mv, n_y); scaled, an MV's range is the same for all
-    ways = [] if cells is None else [_weighed(of, weights)[1] for of in cells.curves]  # (cells, length, n_y) of each MV
+    ways = (
+        [] if cells is None else [weighted_interval(of, weights)[1] for of in cells.curves]
+    )  # (cells, length, n_y) of each MV
     if ways:
         reach = np.maximum(reach, [np.abs(of).max(axis=(0, 1)) for of in ways])
     halves = np.array_split(np.arange(len(fitted)), 2)
@@ -194,7 +195,7 @@ def _regions(
         strongest = int(np.abs(middle).max(axis=1).argmax())
         at, first, last = _place(middle[strongest], late)
         of_cells = curves[:, :, at].mean(axis=2)
-        if groups := alike(_weighed(of_cells, weights)[1]):
+        if groups := alike(weighted_interval(of_cells, weights)[1]):
             cut[j] = (groups, edges, of_cells, first, last)
     if not cut:
         return {}
@@ -209,7 +210,7 @@ def _regions(
         models.append(DirectModel.of(part.y[:, i], np.hstack(inputs), part.run, longest))
     found = {}
     for j, (groups, edges, of_cells, first, last) in cut.items():
-        width, strongest = np.diff(edges), np.abs(_weighed(of_cells, weights)[1]).max()
+        width, strongest = np.diff(edges), np.abs(weighted_interval(of_cells, weights)[1]).max()
         regions = []
         for k, of in enumerate(groups):
             mean = of_cells[:, of] @ width[of] / width[of].sum()
@@ -229,24 +230,6 @@ def _regions(
     return found
 
 
-def _weighed(values: Array, weights: Array) -> tuple[Array, Array, Array]:
-    """(low, middle, high) of values (members, ...) with weights (members,), ``LEFT_OUT`` of the weight at either end.
-
-    Weights that are all alike leave the least and the largest of few values, and their median.
-    """
-    order = np.argsort(values, axis=0, kind="stable")
-    ranked, share = np.take_along_axis(values, order, axis=0), np.cumsum(weights[order], axis=0) / weights.sum()
-
-    def first(reached: NDArray[np.bool_]) -> Array:
-        at = np.where(reached.any(axis=0), reached.argmax(axis=0), len(values) - 1)
-        return np.asarray(np.take_along_axis(ranked, at[None], axis=0)[0])
-
-    near = 1e-9  # of rounding
-    low, high = (first(share > end) for end in (LEFT_OUT + near, 1 - LEFT_OUT - near))
-    middle = 0.5 * (first(share > 0.5 - near) + first(share > 0.5 + near))
-    return low, middle, high
-
-
 def _place(curve: Array, late: int) -> tuple[slice, int, int]:
     """(points of a curve, first row, last row) in which an answer goes from HALF_ANSWER to MOST_ANSWER of its largest.
 
@@ -263,7 +246,7 @@ def _place(curve: Array, late: int) -> tuple[slice, int, int]:
 def _answer(
     of_models: Array, weights: Array, direct: Sequence[DirectModel | None], j: int, first: int, last: int
 ) -> ProvenAnswer:
-    low, model, high = map(float, _weighed(of_models, weights))
+    low, model, high = map(float, weighted_interval(of_models, weights))
     whole, *halves = (None if model is None else model.answer(j, first, last) for model in direct)
     if whole is None:
         return ProvenAnswer(model, low, high, first, last)

@@ -86,7 +86,7 @@ class Rounds:
 NETWORK_SEEDS = (3, 6)
 """Fewest and most seeds of each network that reaches the last round; short records carry more of them."""
 
-QUICK_SEEDS = (2, 6)
+FIRST_ROUND_SEEDS = (2, 6)
 """The same of the first round, in which the best one counts: a free run has poor minima."""
 
 UNITS = (4, 8, 12)
@@ -117,9 +117,9 @@ class NetworkSearch:
         if not units or self.rounds.budget.left() <= 0:
             return []
         offers = _offers([t.structure for t in self.linear], units)
-        offers = self.rounds.affordable(offers, QUICK_SEEDS[0] * (BEGINNING + SHORT_ITERATIONS), 0.4)
+        offers = self.rounds.affordable(offers, FIRST_ROUND_SEEDS[0] * (BEGINNING + SHORT_ITERATIONS), 0.4)
         cost = sum(self.rounds.budget.of(s, BEGINNING + SHORT_ITERATIONS) for s in offers)
-        seeds = int(np.clip(self.rounds.budget.left(0.25) / cost, *QUICK_SEEDS))
+        seeds = int(np.clip(self.rounds.budget.left(0.25) / cost, *FIRST_ROUND_SEEDS))
         tasks = [self._task(s, 0, seed, SHORT_ITERATIONS, last=False) for s in offers for seed in range(seeds)]
         quick = _ranked(self.rounds.trials(tasks, "neural networks, first training")[0])
         second = [

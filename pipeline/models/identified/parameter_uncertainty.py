@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopwright.pipeline.dynamics.step_response import GOES_ON, late_change, reached
 from loopwright.pipeline.historian.settling import MOST_PERIODS
@@ -25,8 +26,11 @@ SD_QUANTILES, SD_MEMBERS = (0.159, 0.841), 8
 MOST_COLOUR = 0.95
 """Largest colour of the noise: a slower one is a disturbance."""
 
+LEFT_OUT = 0.05
+"""Share of the models' weight left out at either end of their answers: one poor model of many vetoes nothing."""
 
-class Doubt(NamedTuple):
+
+class ParameterSpread(NamedTuple):
     """Standard deviations over models that are as likely as the fitted one, see ``spread``."""
 
     gain: Array  # (n_mv,) relative, of the answer that each MV moves most
@@ -34,7 +38,7 @@ class Doubt(NamedTuple):
     dead: Array  # (1,) of the dead time [periods]
 
 
-def doubt_of(curves: Array, n_mv: int) -> Doubt:
+def doubt_of(curves: Array, n_mv: int) -> ParameterSpread:
     """From the models' scaled step responses (members, n_v, length, n_y), the MVs' first.
 
     For each MV the output counts that it moves most. Speed and dead time are those of the MV that is least certain,
@@ -57,7 +61,7 @@ def doubt_of(curves: Array, n_mv: int) -> Doubt:
         )
         taken = rises[:, 1] - rises[:, 0]
         pace[j], dead[j] = spread(taken) / max(float(np.median(taken)), 1.0), spread(rises[:, 0])
-    return Doubt(gain, np.array([pace.max()]), np.array([dead.max()]))
+    return ParameterSpread(gain, np.array([pace.max()]), np.array([dead.max()]))
 
 
 def _strongest(curves: Array) -> Array:
@@ -149,3 +153,21 @@ def drawn(
                 break
             step = step / 2
     return models
+
+
+def weighted_interval(values: Array, weights: Array) -> tuple[Array, Array, Array]:
+    """(low, middle, high) of values (members, ...) with weights (members,), ``LEFT_OUT`` of the weight at either end.
+
+    Weights that are all alike leave the least and the largest of few values, and their median.
+    """
+    order = np.argsort(values, axis=0, kind="stable")
+    ranked, share = np.take_along_axis(values, order, axis=0), np.cumsum(weights[order], axis=0) / weights.sum()
+
+    def first(beyond: NDArray[np.bool_]) -> Array:
+        at = np.where(beyond.any(axis=0), beyond.argmax(axis=0), len(values) - 1)
+        return np.asarray(np.take_along_axis(ranked, at[None], axis=0)[0])
+
+    near = 1e-9  # of rounding
+    low, high = (first(share > end) for end in (LEFT_OUT + near, 1 - LEFT_OUT - near))
+    middle = 0.5 * (first(share > 0.5 - near) + first(share > 0.5 + near))
+    return low, middle, high

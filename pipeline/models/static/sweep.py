@@ -1,4 +1,4 @@
-"""The partition sweep: one RBF network for every number of fuzzy sets, and what each is worth."""
+"""The partition sweep: a fuzzy-means RBF network for every number of fuzzy sets, and the part that learns it so."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,15 +18,18 @@ from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.files import write_json
 from loopwright.pipeline.metrics import per_region, r2, rmse
+from loopwright.pipeline.models.base import Model
+from loopwright.pipeline.models.part import Learnt, Source, StaticPart, predict
 from loopwright.pipeline.models.static.fuzzy_means import (
     check_parameters,
     grid_points,
     scaling,
     select_centres,
+    solve_iterative,
     to_grid,
 )
-from loopwright.pipeline.models.static.least_squares import solve_iterative
-from loopwright.pipeline.models.static.rbf import DESIGN_ROWS, Basis, design_matrix
+from loopwright.pipeline.models.static.rbf import DESIGN_ROWS, RBF, Basis, design_matrix
+from loopwright.pipeline.models.training.regressors import Pairs
 from loopwright.pipeline.plants.simulator import Array
 
 Regions = Mapping[str, tuple[float, float]]
@@ -188,3 +191,73 @@ def _cells(near: NDArray[np.int64]) -> NDArray[np.int64]:
     for column in near.T:
         cell = np.unique(cell * (int(column.max()) + 1) + column, return_inverse=True)[1]
     return cell
+
+
+# ------------------------------------------------------------------------------ how a fuzzy-means RBF network is learnt
+if TYPE_CHECKING:
+    from loopwright.pipeline.models.static.sweep import SweepResult
+
+
+@dataclass(frozen=True, kw_only=True)
+class RbfPart(StaticPart):
+    """A fuzzy-means RBF network.
+
+    ``partitions`` c fuzzy sets an input; ``basis``, ``width``, ``ridge`` as in FuzzyMeansRBF; ``sweep``
+    [first, last] partitions to try on the data seed ``sweep_seed``, for the picture, none where empty.
+    """
+
+    model: ClassVar[type[Model]] = RBF
+    partitions: int = 10
+    basis: Basis = "thin_plate"
+    width: float = 0.5
+    ridge: float = 0.0
+    sweep: tuple[int, ...] = ()
+    sweep_seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.sweep and (len(self.sweep) != 2 or not 2 <= self.sweep[0] <= self.sweep[1]):
+            raise ValueError(f"sweep is {list(self.sweep)}; give [first, last] partitions, 2 <= first <= last")
+
+    def learn(self, source: Source) -> Learnt:
+        """Train by one least-squares fit, and sweep the partitions where asked to."""
+        pairs = self.pairs(source)
+        train, validation = pairs.split(self.train_fraction, self.split, source.seed)
+        model, metrics = self._fit(train, validation, source)
+        if self.split == "random":
+            # Neighbours in time on both sides flatter a random split: the honest figure stands beside it.
+            _, chronological = self._fit(*pairs.split(self.train_fraction, "time", source.seed), source)
+            metrics["time_split"] = {k: chronological[k] for k in ("rmse", "r2", "centres")}
+        swept = self._swept(train, validation, source) if self.sweep and source.seed == self.sweep_seed else None
+        shown = validation.take(np.arange(min(400, len(validation))))
+        predictions = {
+            "time_s": source.data(self.model.kind).time_s[shown.row],
+            "actual": shown.y[:, 0],
+            "predicted": self.limited(predict(model, shown.x), source.signals)[:, 0],
+        }
+        return Learnt(model, metrics, swept, predictions)
+
+    def _fit(self, train: Pairs, validation: Pairs, source: Source) -> tuple[Model, dict[str, Any]]:
+        from loopwright.pipeline.models.static.fuzzy_means import (
+            FuzzyMeansRBF,  # scikit-learn is slow to import, few need it
+        )
+
+        estimator = FuzzyMeansRBF(self.partitions, basis=self.basis, width=self.width, ridge=self.ridge)
+        model = estimator.fit(train.x, train.y).to_torch()
+        metrics = self.scored(model, validation, source)
+        return model, metrics | {"centres": len(estimator.centres_), "c": self.partitions, "n_train": len(train)}
+
+    def _swept(self, train: Pairs, validation: Pairs, source: Source) -> SweepResult:
+        from loopwright.pipeline.models.static.sweep import sweep  # here, as above
+
+        signals = source.signals
+        data = train.x, train.y, validation.x, validation.y
+        return sweep(
+            *data,
+            partitions=range(self.sweep[0], self.sweep[1] + 1),
+            limits=self.limits(signals),
+            regions=source.regions,
+            basis=self.basis,
+            width=self.width,
+            ridge=self.ridge,
+            unit=(signals.mv[0] if self.task == "inverse" else signals.pv[source.pv_index(self.target)]).unit,
+        )

@@ -11,7 +11,7 @@ from loopwright.serving.controller import Array, Controller
 from loopwright.serving.errors import ContractError
 
 
-class StepRows(NamedTuple):
+class VectorizedStep(NamedTuple):
     """One step of every row. A row that ``Controller.step`` would refuse holds no number of worth, and is marked."""
 
     mv: Array  # shape: (n, n_mv)
@@ -19,7 +19,7 @@ class StepRows(NamedTuple):
     refused: NDArray[np.bool_]  # shape: (n,)
 
 
-class ControllerRows:
+class VectorizedController:
     """Steps ``n`` loops of one controller, each with a state of its own.
 
     The graph is the one that the controller steps, in the same session and the same buffers, one row after the other:
@@ -38,7 +38,7 @@ class ControllerRows:
         """States of zeros, shape (n, n_state): no past."""
         return np.zeros((self.n, self.controller.manifest.n_state))
 
-    def step(self, *, sp: Array, pv: Array, dv: Array, mv_applied: Array, state: Array) -> StepRows:
+    def step(self, *, sp: Array, pv: Array, dv: Array, mv_applied: Array, state: Array) -> VectorizedStep:
         """One step of each row; all inputs (n, ...), in engineering units. An input that the law has not is ignored.
 
         Raises ContractError for an input of another shape. A row with an input that is not finite, or whose output is
@@ -61,4 +61,4 @@ class ControllerRows:
             if signal.most < np.inf:
                 pairs = zip(applied.tolist(), moved.tolist(), strict=True)
                 allowed &= np.array([signal.moves(before, after) for before, after in pairs])
-        return StepRows(mv, taken[:, self._next].copy(), np.logical_not(allowed))
+        return VectorizedStep(mv, taken[:, self._next].copy(), np.logical_not(allowed))

@@ -6,16 +6,16 @@ import threading
 
 from processes import within
 
-from loopwright.serving.station.housekeeping import WAITING_LINES, Said
+from loopwright.serving.station.housekeeping import WAITING_LINES, LinePrinter
 
 
 def test_lines_come_in_their_order_and_an_end_waits_for_them() -> None:
     told: list[str] = []
-    said = Said(told.append)
+    printer = LinePrinter(told.append)
     for k in range(100):
-        said.say(str(k))
-    said.end()
-    said.say("after the end")
+        printer.say(str(k))
+    printer.end()
+    printer.say("after the end")
     assert told == [*map(str, range(100)), "after the end"]
 
 
@@ -28,11 +28,11 @@ def test_a_reader_that_raises_stops_nothing() -> None:
             raise OSError(28, "No space left on device")
         told.append(line)
 
-    said = Said(tell)
+    printer = LinePrinter(tell)
     for line in ("one", "bad", "two"):
-        said.say(line)
-    said.end()
-    said.say("bad")
+        printer.say(line)
+    printer.end()
+    printer.say("bad")
     assert told == ["one", "two"]
 
 
@@ -46,20 +46,20 @@ def test_a_reader_that_stands_still_holds_nobody_up_and_is_told_what_it_missed()
         go_on.wait(30)
         told.append(line)
 
-    said = Said(tell)
-    said.say("first")
+    printer = LinePrinter(tell)
+    printer.say("first")
     assert began.wait(10)
     for k in range(WAITING_LINES + 7):
-        said.say(str(k))
+        printer.say(str(k))
     go_on.set()
     assert within(10, lambda: len(told) == WAITING_LINES + 2)
-    said.end()
+    printer.end()
     assert told[:2] == ["first", "0"]
     assert told[-2:] == [str(WAITING_LINES - 1), "7 more lines were not said here: nobody read them in time"]
 
 
 def test_what_was_never_used_has_no_thread() -> None:
     before = threading.active_count()
-    said = Said(print)
-    said.end()
+    printer = LinePrinter(print)
+    printer.end()
     assert threading.active_count() == before

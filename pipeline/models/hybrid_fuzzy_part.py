@@ -14,7 +14,7 @@ from scipy import linalg
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.metrics import r2, rmse
 from loopwright.pipeline.models.base import Model, simulate
-from loopwright.pipeline.models.fuzzy.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
+from loopwright.pipeline.models.hybrid_fuzzy import COEFFICIENTS, HybridFuzzy
 from loopwright.pipeline.models.part import Learnt, Part, Source, predict
 from loopwright.pipeline.models.training.regressors import split_in_time
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator

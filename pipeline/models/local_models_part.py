@@ -12,7 +12,7 @@ import torch
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.metrics import fit_percent
 from loopwright.pipeline.models.base import Model, simulate
-from loopwright.pipeline.models.local.local_models import LocalModels
+from loopwright.pipeline.models.local_models import LocalModels
 from loopwright.pipeline.models.part import Learnt, Part, Source
 from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Array

@@ -1,1 +1,0 @@
-"""Local linear models and the linearized plant. No blending of controllers stands here."""
