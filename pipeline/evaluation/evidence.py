@@ -264,15 +264,24 @@ class Evidence:
         best of such laws is the one whose MVs travel least there. A law that locked up on one of them, or that is not
         shipped, is left out. So is one that does not beat the loop that the plant was run by before, there, in each
         test and where the record is replayed. Where the tests run on models, a law that swings to the end in any of
-        them comes behind those that do not: its plant may be one of these models, and then it is worse than any figure
-        says. This much of a say the scored tests have. Without development figures the gate score decides.
+        them without noise comes behind those that do not: its plant may be one of these models, and then it is worse
+        than any figure says. This much of a say the scored tests have. Noise moves any loop, one that does not swing by
+        itself too. Without development figures the gate score decides.
         """
-        scores = self._candidates
-        if self.case.on_models:
-            calm = {n: e for n, e in scores.items() if not self.laws[n].metrics.swings}
-            scores = calm or scores
+        scores = self._calm
         alike = [n for n in scores if scores[n] <= ALIKE_ERRORS * min(scores.values())]
         return min(alike, key=lambda n: (self.laws[n].development_travel, scores[n]), default=None)
+
+    @cached_property
+    def _calm(self) -> dict[str, float]:
+        """The candidates that swing in no test without noise; all of them where each does."""
+        if not self.case.on_models:
+            return self._candidates
+        calm = {n: e for n, e in self._candidates.items() if not self._swings_by_itself(n)}
+        return calm or self._candidates
+
+    def _swings_by_itself(self, law: str) -> bool:
+        return any(not test.endswith(NOISE_SUFFIX) for test in self.laws[law].metrics.swings)
 
     @cached_property
     def _candidates(self) -> dict[str, float]:
@@ -336,10 +345,12 @@ class Evidence:
             return "it has the lowest gate score of the laws that did not lock up"
         others = ", ".join(f"{n} {e:.4g}" for n, e in errors.items() if n != self.best)
         beside = f" (others: {others})" if others else ""
-        lowest = errors[self.best] <= min(self._candidates.values())
+        lowest = errors[self.best] <= min(self._calm.values())
         place = (
             "is the lowest" if lowest else f"is within {ALIKE_ERRORS - 1:.0%} of the lowest, and its MVs travel least"
         )
+        if behind := [n for n in self._candidates if n not in self._calm]:
+            place += f", of the laws that do not swing to the end on a model, as {' and '.join(behind)} does"
         return f"{self._development}, which are not scored, {place}: " + (
             f"{errors[self.best]:.4g} {self.case.unit}".rstrip() + beside
         )

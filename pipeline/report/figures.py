@@ -34,7 +34,7 @@ from loopwright.pipeline.report.own_acceptance import shipped_laws, worst_test
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 MODEL_PICTURES: tuple[tuple[str, Draw, str], ...] = (
-    ("free_run", free_run_picture, "The free run over rows that the fit never saw, and its residual"),
+    ("free_run", free_run_picture, "Predictions over rows that the fit never saw, and their residual"),
     ("step_responses", step_responses_picture, "Step responses, with the band of all fits that are as good"),
     (
         "gains",

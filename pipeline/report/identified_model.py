@@ -19,6 +19,7 @@ from loopwright.pipeline.pictures.numbers import figure, number
 
 SCREENING = "screening.json"  # beside the record
 GONE = "the model explains the rest, no drift is left, and there is nothing to do"
+CARRIED = "a load that follows it; a tag that measures its cause as dv makes the model better"
 FOLLOWED = (
     "a gain or a level that moves explains most of it: the plant drifts inside the record, and no model of these "
     "inputs can follow. Feedback corrects it; a tag that measures the cause as dv makes the model better"
@@ -39,13 +40,17 @@ def drift_answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...
     if data is None or replayed is None or not (path := data.with_name(SCREENING)).is_file():
         return ()
     report = read_json(path)
-    drifts = bool((part.get("structure") or {}).get("drifts"))
+    structure = part.get("structure") or {}
+    drifts = bool(structure.get("drifts"))
     rows = max((row["settling_s"] for row in report["verdict"]["inputs"]), default=0.0) / report["period_s"]
     runs = [found for name in evidence.models if "free run" in (found := evidence.predictions(name))]
     said, sentences = _alarms(report), []
     for i, cv in enumerate(evidence.case.plant_class.sp_signals):
         if cv.name in said:
             span = float(np.ptp(usual(replayed[0].pv[:, i])))
+            if structure.get("rows_ahead") is not None:
+                sentences.append(f"{said[cv.name]} The model has {CARRIED}.")
+                continue
             left = levels_of(runs[0]["measured"][:, i], runs[0]["free run"][:, i], span, int(rows)) if runs else None
             sentences.append(f"{said[cv.name]} {_answer(left, drifts)}")
     return tuple(sentences)
@@ -81,6 +86,9 @@ APART = 2  # periods between likely dead times from which on the report asks for
 SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
 
 
+FREE_RUN = "in a free run: a model predicts from its own predictions"
+
+
 @dataclass(frozen=True, slots=True)
 class ModelSection:
     """Sentences, and the rows of three tables as texts."""
@@ -90,6 +98,7 @@ class ModelSection:
     answers: tuple[tuple[str, ...], ...]  # of each variable to each input, see ANSWERS
     tried: tuple[tuple[str, ...], ...]  # candidates, see TRIED
     judged: str = "free run"  # what the candidates' held-out errors are errors of
+    predicted: str = FREE_RUN  # how the rows of the figures were predicted
 
 
 VARIABLES = (
@@ -113,19 +122,43 @@ def model_section(evidence: Evidence) -> ModelSection | None:
     mvs = [s.name for s in evidence.case.plant_class.mv_signals]
     verdicts = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs), *_dead_times(evidence, part))
     sentences = (*verdicts, *_noisy_disturbances(evidence, part), *_asked(evidence), *_one_side(evidence))
-    judged = str((part.get("structure") or {}).get("judged") or "free run")
-    return ModelSection(sentences, _variables(evidence, part), _answers(evidence, part), _tried(part), judged)
+    structure = part.get("structure") or {}
+    judged, rows = str(structure.get("judged") or "free run"), structure.get("rows_ahead")
+    predicted = FREE_RUN if rows is None else (
+        f"1 to {rows} rows ahead in turn: every {rows} rows a prediction begins from what was measured until then; "
+        "the residual's correlations in the table are those of predictions one row ahead"
+    )  # fmt: skip
+    tables = (_variables(evidence, part), _answers(evidence, part), _tried(part))
+    return ModelSection(sentences, *tables, judged, predicted)
 
 
 def _verdicts(part: Mapping[str, Any]) -> tuple[str, ...]:
     """Linear or not, stable or not, and what the fit itself warns of."""
     structure, stability = part.get("structure") or {}, part.get("stability") or {}
     radius = part.get("spectral_radius")
-    words = [structure.get("verdict"), stability.get("verdict"), structure.get("row_convention")]
+    words = [structure.get("verdict"), _wandering(structure), stability.get("verdict"), structure.get("row_convention")]
     if not stability and radius is not None:
         words.append(f"the largest pole at rests of the visited range is {radius:.4g}; at most 1 is stable")
     warnings = tuple(f"Warning: {text}." for text in part.get("warnings") or ())
     return (*(f"{text[:1].upper()}{text[1:]}." for text in words if text), *warnings)
+
+
+def _wandering(structure: Mapping[str, Any]) -> str:
+    """Both kinds of model beside each other, where free runs missed more than noise; empty elsewhere."""
+    ahead = structure.get("ahead")
+    if not ahead:
+        return ""
+    words = (
+        "free runs miss more than noise: a load wanders that nobody measures, the plant drifts, or the models lack "
+        f"something. 1 to {ahead['rows']} rows ahead, over rows that no fit saw, a model with loads errs by "
+        f"{number(ahead['one_step'])}, the best of free runs by {number(ahead['free_runs'])}, where 1 is the "
+        "variable's standard deviation"
+    )
+    if not ahead["wanders"]:
+        return f"{words}: the model of free runs stays"
+    return (
+        f"{words}: the model with loads is taken. If the plant has changed since the record began, its gains are means"
+    )
 
 
 def _asked(evidence: Evidence) -> tuple[str, ...]:

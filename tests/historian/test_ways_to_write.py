@@ -57,6 +57,8 @@ NUMBERED = ("Time", "101", "102", "103")
 HEADS = {
     "titles filled up with separators": (text(HEADER, above=["Report of unit 7;;;", ";;;", "Made by;hand;;"]), NAMES),
     "titles with dates": (text(HEADER, above=["From;2024-03-04 06:00;To;2024-03-05 06:00"]), NAMES),
+    "a title that is dated": (text(HEADER, above=["Report of unit 7;;;", "Exported 12.03.2025;;;"]), NAMES),
+    "a dated title alone": (text(HEADER, above=["Exported 12.03.2025;;;"]), NAMES),
     "titles and units": (text(HEADER, above=["Report;;;"], below=";degC;%;kg/h"), NAMES),
     "descriptions and units": (
         text(HEADER, below="Description;reactor temperature;fuel;feed\nUnit;degC;%;kg/h"),

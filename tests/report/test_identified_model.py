@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from own_cases import two_lags
 
-from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, ModelSection, model_section
+from loopwright.pipeline.report.identified_model import ANSWERS, FREE_RUN, TRIED, VARIABLES, ModelSection, model_section
 from loopwright.serving.manifest import Signal
 
 
@@ -56,6 +56,21 @@ def test_verdicts_are_sentences(section: ModelSection) -> None:
     )
     assert section.verdicts[3].startswith("The tests ask for y0 from ")
     assert section.verdicts[3].endswith("which the MVs can hold within the record. Nothing is known of others.")
+
+
+@pytest.mark.parametrize("wanders", [True, False])
+def test_both_kinds_of_model_are_told_where_a_load_wanders(
+    wanders: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ahead = {"one_step": 0.12, "free_runs": 0.34, "rows": 30, "wanders": wanders}
+    structure = {"verdict": "linear", "hidden": 0, "ahead": ahead, "rows_ahead": 30 if wanders else None}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": {**PART, "structure": structure}}}}}}  # fmt: skip
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    assert ("0.12" in found.verdicts[1], "0.34" in found.verdicts[1]) == (True, True)
+    assert ("model with loads is taken" in found.verdicts[1]) is wanders
+    assert (found.predicted != FREE_RUN) is wanders  # the figures of the table are of that kind too
 
 
 def test_every_variable_has_its_fit_and_its_residual(section: ModelSection) -> None:

@@ -89,6 +89,17 @@ def test_the_best_law_must_settle_in_every_test() -> None:
     assert (bad.measured, bad.holds) == ("0.036 m in test spoilt", False)
 
 
+@pytest.mark.parametrize(
+    ("test", "best"), [("spoilt", "pid"), ("development", "pid"), ("development_noise", "predictive")]
+)
+def test_a_law_that_swings_on_a_model_is_the_best_only_where_noise_moves_it(test: str, best: str) -> None:
+    lively = law("predictive", 1.0)
+    lively = replace(lively, metrics=replace(lively.metrics, swings={test: {"0": 1}}))
+    found = evidence(lively, law("pid", 2.0))
+    assert found.best == best
+    assert ("do not swing" in found.why_best) is (best == "pid")
+
+
 def test_each_shipped_law_is_judged_and_not_the_best_alone() -> None:
     other = law("predictive", 3.0, spoilt=1.3, load=0.01)
     other = replace(other, metrics=replace(other.metrics, swings={"spoilt": {"0": 1}}))

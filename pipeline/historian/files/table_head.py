@@ -102,11 +102,11 @@ def _anchors(kinds: Sequence[Sequence[str]], width: int) -> dict[int, str]:
 
 
 def _is_data(kinds: Sequence[str], anchors: dict[int, str]) -> bool:
-    """Whether a row has values: none without its time, and more numbers than texts."""
+    """Whether a row has values: none without its time or with it alone, as a dated title; more numbers than texts."""
     right = sum(kinds[j] == kind for j, kind in anchors.items())
     wrong = sum(kinds[j] == "text" for j in anchors)
     lead = min((j for j, kind in anchors.items() if kind == "time"), default=min(anchors))
-    return right > 0 and right >= wrong and kinds[lead] == anchors[lead]
+    return right > min(1, len(anchors) - 1) and right >= wrong and kinds[lead] == anchors[lead]
 
 
 def _has_values(kinds: Sequence[str] | None, anchors: dict[int, str]) -> bool:

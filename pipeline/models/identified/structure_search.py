@@ -26,7 +26,7 @@ from loopwright.pipeline.models.identified.scaled_record import (
 )
 from loopwright.pipeline.models.identified.steady_states import INTEGRATES, slowest_pole
 from loopwright.pipeline.models.identified.structure import FARTHEST, Budget, CandidateFits, Problem, best_of
-from loopwright.pipeline.models.identified.wandering_load import foresees_better
+from loopwright.pipeline.models.identified.wandering_load import ErrorsAhead, errors_ahead
 from loopwright.pipeline.models.part import Groundwork, Source
 
 SETTLING_POLE = 0.98
@@ -67,7 +67,7 @@ class Selection:
     innovations: float | None = None  # nats by which one-step errors prefer the network; None: free runs judged
     farthest: float = FARTHEST  # scaled: where rests of a network may lie
     dead_times: Sequence[tuple[int, int]] = ()  # [periods] least and most of each input that explain the rows alike
-    wanders: bool = False  # whether one-step errors judged for loads that wander, not for a controller that acts
+    ahead: ErrorsAhead | None = None  # of both kinds of model, where free runs missed more than noise
     refused: bool = False  # whether the record does not prove the network's gains: the linear model takes its place
 
     @property
@@ -182,9 +182,8 @@ def _beside_loads(rounds: Rounds, found: Selection, orders: Sequence[int], units
     except ModelError:  # no filter follows the record
         return found
     spent = found.spent + other.spent
-    if not foresees_better(rounds, other.chosen, found.chosen):
-        return replace(found, spent=spent)
-    return replace(other, spent=spent, wanders=True)
+    ahead = errors_ahead(rounds, other.chosen, found.chosen)
+    return replace(other if ahead.wanders else found, spent=spent, ahead=ahead)
 
 
 def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) -> Selection:
@@ -291,9 +290,6 @@ def _misses(problem: Problem, trial: CandidateFits, ratio: float) -> bool:
 MINUTES = 2.0
 """Budget for each output, in minutes of one core."""
 
-MORE = 3
-"""Times as many rows of a record in closed loop: little of it tells of the plant, and one-step errors are quick."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Searched:
@@ -327,7 +323,7 @@ class StructureSearch(Groundwork[Searched]):
         seen = source.data(self.kind)
         n_y, n_mv = len(source.signals.pv if self.all_measured else source.signals.sp), len(source.signals.mv)
         back = seen.fed_back or fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
-        record = informative(seen, MORE * self.rows if back else self.rows)
+        record = informative(seen, self.rows)
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)
         disturbances = Disturbances.of(ScaledRecord.of(seen, scales), data, n_mv)

@@ -27,6 +27,7 @@ from loopwright.pipeline.models.identified.steady_states import (
 )
 from loopwright.pipeline.models.identified.structure import CandidateFits, Problem
 from loopwright.pipeline.models.identified.structure_search import Selection
+from loopwright.pipeline.models.identified.wandering_load import ErrorsAhead
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.manifest import Signal
 
@@ -59,11 +60,13 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
     elif selection.refused:
         words = "linear: a network was chosen first, but the record does not prove its gains, and proves these"
     elif selection.innovations is not None and not selection.nonlinear:
-        where = "in which loads wander" if selection.wanders else "in closed loop"
+        where = "in closed loop" if selection.ahead is None else "in which loads wander"
         words = (
             f"linear: one row ahead no network is better by enough to count; a record {where} often does not "
             "tell whether gains change over the range"
         )
+    elif selection.nonlinear and selection.innovations is not None:
+        words = f"nonlinear: one row ahead the network is better by {selection.innovations:.3g} nats over held-out rows"
     elif selection.nonlinear:
         words = f"nonlinear by a factor of {selection.factor:.3g} in the held-out free run"
     else:
@@ -83,6 +86,7 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
         "drifts": selection.drifts,
         "noise": s.noise,
         "judged": _judged(selection),
+        "ahead": _ahead_figures(selection.ahead),
         "rows_ahead": None if selection.innovations is None else PREDICTED_AHEAD,
         "row_convention": f"the MVs of a row act on the outputs of the {'same' if s.same_row else 'next'} row",
         "held_out_error": chosen.error,
@@ -96,9 +100,16 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
     }
 
 
+def _ahead_figures(found: ErrorsAhead | None) -> dict[str, Any] | None:
+    """Both errors, the rows that they look ahead, and whether a load wanders; None where nothing was compared."""
+    if found is None or not np.all(np.isfinite(found)):
+        return None
+    return {**found._asdict(), "rows": PREDICTED_AHEAD, "wanders": found.wanders}
+
+
 def _judged(selection: Selection) -> str:
     if selection.innovations is not None:
-        why = "loads wander in the record" if selection.wanders else "the MVs follow the PVs"
+        why = "the MVs follow the PVs" if selection.ahead is None else "loads wander in the record"
         return f"one-step errors with a model of the loads ({why})"
     return "free run" + (" beyond a gain and a level of each part of the record" if selection.drifts else "")
 

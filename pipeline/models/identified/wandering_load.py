@@ -10,6 +10,7 @@ Source: L. Ljung, System identification, 2nd ed., 1999, sections 3.3 (prediction
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,18 +24,29 @@ FILTER_ITERATIONS = 20
 """Iterations in which the filter's gain of a model of free runs is fitted."""
 
 
-def foresees_better(rounds: Rounds, trial: CandidateFits, other: CandidateFits) -> bool:
-    """Whether a candidate foresees the held-out rows better than another, by ``error_ahead`` over all folds.
+class ErrorsAhead(NamedTuple):
+    """Scaled errors ``PREDICTED_AHEAD`` rows ahead, of the model that one-step errors chose, and of free runs' choice.
 
-    False where no filter of one of them follows the record: nothing is compared then.
+    Infinite where no filter of a model follows the record.
     """
-    tasks = [(of, fold) for of in (trial, other) for fold in of.folds]
+
+    one_step: float
+    free_runs: float
+
+    @property
+    def wanders(self) -> bool:
+        """Whether the model with loads foresees the rows better; False where nothing can be compared."""
+        return self.one_step < self.free_runs < np.inf
+
+
+def errors_ahead(rounds: Rounds, one_step: CandidateFits, free_runs: CandidateFits) -> ErrorsAhead:
+    """The rms over all folds of ``error_ahead`` of both candidates."""
+    tasks = [(of, fold) for of in (one_step, free_runs) for fold in of.folds]
     found = parallel_map(
         partial(error_ahead, rounds.problem), tasks, f"{rounds.label}: errors some rows ahead of both kinds of model"
     )
-    of_trial, of_other = found[: len(trial.folds)], found[len(trial.folds) :]
-    rms = [float(np.sqrt(np.mean(np.square(errors)))) for errors in (of_trial, of_other)]
-    return bool(np.all(np.isfinite(rms)) and rms[0] < rms[1])
+    both = found[: len(one_step.folds)], found[len(one_step.folds) :]
+    return ErrorsAhead(*(float(np.sqrt(np.mean(np.square(errors)))) for errors in both))
 
 
 def error_ahead(problem: Problem, task: tuple[CandidateFits, int]) -> float:

@@ -15,7 +15,7 @@ from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.innovations import Innovations, begun
 from loopwright.pipeline.models.identified.network_search import Rounds
 from loopwright.pipeline.models.identified.structure import Budget, CandidateFits
-from loopwright.pipeline.models.identified.wandering_load import error_ahead, foresees_better
+from loopwright.pipeline.models.identified.wandering_load import ErrorsAhead, error_ahead, errors_ahead
 from loopwright.pipeline.models.part import Learnt, Source
 from loopwright.pipeline.records.record import Record
 
@@ -51,6 +51,8 @@ def test_free_runs_judge_where_nothing_wanders(monkeypatch: pytest.MonkeyPatch) 
 def test_errors_some_rows_ahead_judge_where_a_load_wanders(seed: int) -> None:
     found = learnt(1.5, seed).metrics
     assert found["structure"]["rows_ahead"] == 30
+    ahead = found["structure"]["ahead"]
+    assert 0 < ahead["one_step"] < ahead["free_runs"] < 1
     assert found["structure"]["noise"] in ("gain", "all")
     # The measurement's noise, beside a load fifteen times as large.
     assert found["outputs"]["y0"]["noise_sd"] == pytest.approx(0.1, rel=0.4)
@@ -69,9 +71,10 @@ def test_a_correction_that_is_given_keeps_free_runs() -> None:
 def test_of_both_models_the_one_that_foresees_better_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     taken = {}
     for better in (True, False):
-        monkeypatch.setattr(structure_search, "foresees_better", lambda *_, better=better: better)
+        errors = ErrorsAhead(0.1, 0.2) if better else ErrorsAhead(0.2, 0.1)
+        monkeypatch.setattr(structure_search, "errors_ahead", lambda *_, errors=errors: errors)
         taken[better] = PART.groundwork().done(Source(with_load(1.5), SOURCE_SIGNALS), "search").selection
-    assert [taken[better].wanders for better in (True, False)] == [True, False]
+    assert [taken[better].ahead.wanders for better in (True, False)] == [True, False]
     assert taken[True].innovations is not None
     assert taken[False].innovations is None
     assert taken[True].spent == pytest.approx(taken[False].spent)  # both searches are counted
@@ -88,7 +91,9 @@ def test_error_ahead_of_a_free_run_is_that_of_the_best_filter_about_its_plant() 
     same = CandidateFits(trial.structure, {(0, 0): replace(fitted, model=filtered)})
     assert error_ahead(problem, (same, 0)) == pytest.approx(whole, rel=0.1)
     rounds = Rounds(problem, Budget(1.0, len(problem.data), 1), "search")
-    assert not foresees_better(rounds, trial, trial)
+    both = errors_ahead(rounds, trial, trial)
+    assert both.one_step == both.free_runs
+    assert not both.wanders
 
 
 def test_nothing_is_compared_where_no_filter_follows(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,10 +106,9 @@ def test_nothing_is_compared_where_no_filter_follows(monkeypatch: pytest.MonkeyP
     def none(plant: Dynamics, data: object) -> Innovations:
         raise wandering_load.ModelError("none")
 
-    rounds = Rounds(problem, Budget(1.0, len(problem.data), 1), "search")
     for name, instead in (("ahead", explodes), ("begun", none)):
         with monkeypatch.context() as patch:
             patch.setattr(wandering_load, name, instead)
             assert error_ahead(problem, (trial, 0)) == np.inf
-    monkeypatch.setattr(wandering_load, "error_ahead", lambda _, task: np.inf)
-    assert not foresees_better(rounds, trial, trial)
+    assert not ErrorsAhead(0.1, np.inf).wanders
+    assert not ErrorsAhead(np.inf, 0.1).wanders
