@@ -65,7 +65,8 @@ def test_both_kinds_of_model_are_told_where_a_load_wanders(
     monkeypatch.chdir(tmp_path)
     ahead = {"one_step": 0.12, "free_runs": 0.34, "rows": 30, "wanders": wanders}
     structure = {"verdict": "linear", "hidden": 0, "ahead": ahead, "rows_ahead": 30 if wanders else None}
-    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": {**PART, "structure": structure}}}}}}  # fmt: skip
+    part = {**PART, "structure": structure}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
     found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
     assert found is not None
     assert ("0.12" in found.verdicts[1], "0.34" in found.verdicts[1]) == (True, True)

@@ -84,8 +84,8 @@ class IdentifiedPart(Part):
     given here is that of the held-out runs too, as unstable plants need. ``minutes`` is the budget of the search on
     one core (None: 2, and 2 more for each further output), counted in nominal work so that results are reproducible;
     the best so far is kept; where models with their noise are searched beside others, each search has as many.
-    ``rows`` is the most rows that are fitted, of longer records the stretches in which the inputs move most; each search
-    then tries fewer candidates, as its budget says.
+    ``rows`` is the most rows that are fitted, of longer records the stretches in which the inputs move most; the more
+    rows, the fewer candidates the budget carries.
 
     Where the MVs follow the outputs, and no ``correction`` is given, models with their noise are fitted and judged by
     one-step errors in place of free runs; else beside them, where the free runs miss more than noise, and errors some
