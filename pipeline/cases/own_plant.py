@@ -50,6 +50,10 @@ GATE = {"held_out": 0.5, "held_out_noise": 0.2, LOADED: 0.15, "spoilt": 0.15}
 GATE_WITH_MEASURED = {"held_out": 0.5, "held_out_noise": 0.2, LOADED: 0.1, MEASURED: 0.1, "spoilt": 0.1}
 
 
+LEAST_ASKED = 0.01
+"""Of a range: so far set points go at least, for what is counted in shares of it; none may be divided by nothing."""
+
+
 class OwnCase(OwnEnsemble):
     """Tests of an own plant: on models of its record that had no part in tuning, and on such models spoilt.
 
@@ -95,8 +99,9 @@ class OwnCase(OwnEnsemble):
 
     @cached_property
     def asked(self) -> Array:
-        """How far the set points of test ``held_out`` go, (n_cv,)."""
-        return np.asarray(np.ptp(np.concatenate([test.sp for test in self._held_out]), axis=0))
+        """How far the set points of test ``held_out`` go, (n_cv,), and at least ``LEAST_ASKED`` of the ranges."""
+        went = np.ptp(np.concatenate([test.sp for test in self._held_out]), axis=0)
+        return np.asarray(np.maximum(went, LEAST_ASKED * _spans(self.signals.sp)))
 
     @cached_property
     def spans(self) -> Array:

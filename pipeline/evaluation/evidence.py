@@ -14,7 +14,16 @@ from loopwright.pipeline.errors import PipelineError, ReportError
 from loopwright.pipeline.evaluation.case import Case, Curve
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.extrapolation import grounds_of
-from loopwright.pipeline.evaluation.law_evidence import BASE, Array, Form, LawEvidence, LawMetrics, Loop, arrays
+from loopwright.pipeline.evaluation.law_evidence import (
+    BASE,
+    Array,
+    Form,
+    LawEvidence,
+    LawMetrics,
+    Loop,
+    arrays,
+    without_noise,
+)
 from loopwright.pipeline.evaluation.metric import gate_ratio, ratio_to_bound
 from loopwright.pipeline.evaluation.model_evidence import model_figure
 from loopwright.pipeline.evaluation.typed_json import read_mapping
@@ -281,7 +290,7 @@ class Evidence:
         return calm or self._candidates
 
     def _swings_by_itself(self, law: str) -> bool:
-        return any(not test.endswith(NOISE_SUFFIX) for test in self.laws[law].metrics.swings)
+        return bool(without_noise(self.laws[law].metrics.swings))
 
     @cached_property
     def _candidates(self) -> dict[str, float]:
@@ -350,7 +359,8 @@ class Evidence:
             "is the lowest" if lowest else f"is within {ALIKE_ERRORS - 1:.0%} of the lowest, and its MVs travel least"
         )
         if behind := [n for n in self._candidates if n not in self._calm]:
-            place += f", of the laws that do not swing to the end on a model, as {' and '.join(behind)} does"
+            swinging = ", ".join(behind)
+            place += f", of the laws that do not swing to the end on a model without noise (those that do: {swinging})"
         return f"{self._development}, which are not scored, {place}: " + (
             f"{errors[self.best]:.4g} {self.case.unit}".rstrip() + beside
         )

@@ -69,7 +69,7 @@ class Grounds:
     record: RecordVerdict | None = None
     farthest: Mapping[str, str] = field(default_factory=dict)
     proven: bool = False  # rows that no fit saw prove the models, whatever its screening said
-    ahead: int | None = None  # samples that the fit was predicted ahead at most, of a record in closed loop; None: all
+    ahead: int | None = None  # samples that the fit was predicted ahead at most, where loads were modelled; None: all
 
     @property
     def doubt(self) -> str:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 from loopwright.pipeline.files import write_text
+from loopwright.pipeline.simulation import NOISE_SUFFIX
 
 Array = NDArray[np.float64]
 Loop = dict[str, Array]
@@ -138,6 +139,11 @@ class LawMetrics:
     def of(cls, tree: Mapping[str, Any], where: str = "metrics.json") -> LawMetrics:
         """The mapping in such a file; ReportError names what is wrong with it and the remedy."""
         return parsed(cls, tree, where, METRICS_SCHEMA)
+
+
+def without_noise(tests: Mapping[str, Mapping[str, int]]) -> dict[str, Mapping[str, int]]:
+    """Those tests in which nothing but the loop itself keeps a swing up: noise moves any loop."""
+    return {test: seeds for test, seeds in tests.items() if not test.endswith(NOISE_SUFFIX)}
 
 
 def lock_up_text(locked_up: Mapping[str, Mapping[str, int]]) -> str:

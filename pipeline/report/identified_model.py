@@ -32,7 +32,7 @@ LEFT = (
 
 
 def drift_answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
-    """A sentence for each CV of which the screening said that it drifts: what the model's free run leaves of it.
+    """A sentence for each CV of which the screening said that it drifts: what the model leaves of it.
 
     ``part`` holds the figures of the identified model. A record without a screening beside it has none.
     """
@@ -150,7 +150,7 @@ def _wandering(structure: Mapping[str, Any]) -> str:
         return ""
     words = (
         "free runs miss more than noise: a load wanders that nobody measures, the plant drifts, or the models lack "
-        f"something. 1 to {ahead['rows']} rows ahead, over rows that no fit saw, a model with loads errs by "
+        f"something. 1 to {ahead['rows']} rows ahead, over held-out rows, a model with loads errs by "
         f"{number(ahead['one_step'])}, the best of free runs by {number(ahead['free_runs'])}, where 1 is the "
         "variable's standard deviation"
     )

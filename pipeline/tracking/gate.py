@@ -22,8 +22,8 @@ Aliases:
     says why.
 ``champion``
     one in a case: the best version with the lowest score among the case's controllers, or the one
-    that a person promoted. A controller whose closed loop swings to the end of a test stands behind
-    all that do not.
+    that a person promoted. A controller whose closed loop swings to the end of a test without
+    noise stands behind all that do not.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from loopwright.pipeline.evaluation.law_evidence import lock_up_text
+from loopwright.pipeline.evaluation.law_evidence import lock_up_text, without_noise
 from loopwright.pipeline.evaluation.validation import GateResult, Validation
 
 
@@ -54,7 +54,7 @@ class Gate:
     times: str = "× NMPC"  # the same, short
     unproven: tuple[str, ...] = ()  # why the record of an own plant does not prove the models of the tests
     doubt: str = ""  # why a model of the record of an own plant is doubtful, by its screening
-    swings: str = ""  # tests, of which data seeds, in which a closed loop swings to the end
+    swings: str = ""  # tests without noise, of which data seeds, in which a closed loop swings to the end
     worse: tuple[str, ...] = ()  # tests with a larger error than under the loop that the plant was run by before
     withheld: str = ""  # why it is not shipped, a clause after its name
 
@@ -82,7 +82,7 @@ class Gate:
             gate.times,
             () if validation.grounds is None else validation.grounds.unproven,
             "" if validation.grounds is None else validation.grounds.doubt,
-            "" if result is None else lock_up_text(result.swings),
+            "" if result is None else lock_up_text(without_noise(result.swings)),
             own.worse,
             "" if result is None else result.withheld,
         )

@@ -30,7 +30,8 @@ HAND_BACK = "hand back"
 class MvSender:
     """The MVs that wait to be written, why the last one did not arrive, and the lease under which they are written.
 
-    The loop calls ``called``, ``stands``, ``refuse`` and ``ask_back``, the connection's thread all others.
+    The loop calls ``called``, ``stands``, ``refuse``, ``ask_back`` and ``unread``, counts ``scans``, notes ``told_on``
+    and adds to ``outbox``; the connection's thread calls ``begin``, ``send`` and ``keep_lease``, and sets ``shown_on``.
 
     Parameters
     ----------

@@ -90,7 +90,8 @@ def test_the_best_law_must_settle_in_every_test() -> None:
 
 
 @pytest.mark.parametrize(
-    ("test", "best"), [("spoilt", "pid"), ("development", "pid"), ("development_noise", "predictive")]
+    ("test", "best"),
+    [("spoilt", "pid"), ("held_out", "pid"), ("spoilt_noise", "predictive"), ("development_noise", "predictive")],
 )
 def test_a_law_that_swings_on_a_model_is_the_best_only_where_noise_moves_it(test: str, best: str) -> None:
     lively = law("predictive", 1.0)

@@ -35,8 +35,8 @@ class Identified(Model):
     each MV and ``pace_sd`` of the time constant are relative, ``dead_sd`` counts periods: what the record leaves open.
     ``rest`` gives the state of a rest from [y scaled, v scaled, 1], ``rest_cov`` the covariance of its error. ``dead``
     holds, for each MV, the fewest whole periods that pass before any output answers (0: the next sample does).
-    ``load_moves`` are changes of the loads from row to row over ``recorded`` rows of a record in closed loop, 0 of
-    another: x(k+1) has the sum of them added to its first ``n_y`` states. ``dv_noise`` and ``dv_change`` are standard
+    ``load_moves`` are changes of the loads from row to row over ``recorded`` rows, 0 of a model without loads:
+    x(k+1) has the sum of them added to its first ``n_y`` states. ``dv_noise`` and ``dv_change`` are standard
     deviations of the measured disturbances: of their noise, which is 0 where none is seen, and of their own change a
     period.
 

@@ -72,7 +72,7 @@ NEAR_BY_ROWS = 1.002
 
 @dataclass(frozen=True, kw_only=True)
 class IdentifiedPart(Part):
-    """A linear or nonlinear state-space model of the process variables, its structure chosen by held-out free runs.
+    """A linear or nonlinear state-space model of the process variables, its structure chosen by held-out rows.
 
     The outputs are the ``controlled`` variables, or all ``measured`` process variables: a second one tells of states
     that the controlled one hides. The inputs are all MVs and measured disturbances. ``member`` numbers the models of
@@ -282,7 +282,7 @@ def _residuals(problem: Problem, structure: Structure, model: Dynamics) -> tuple
 
 
 def _load_moves(model: Dynamics, whole: Sequence[Stretch]) -> Array:
-    """Changes (n, n_y) of the loads from row to row, scaled, over rows of a record in closed loop; none of another."""
+    """Changes (n, n_y) of the loads from row to row, scaled; none of a model without loads."""
     if not isinstance(model, Innovations):
         return np.empty((0, whole[0].y.shape[1]))
     return load_moves(model, whole)[:LOAD_ROWS]

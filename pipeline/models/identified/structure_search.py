@@ -175,15 +175,21 @@ def by_free_runs(
 
 
 def _beside_loads(rounds: Rounds, found: Selection, orders: Sequence[int], units: Sequence[int]) -> Selection:
-    """The outcome of ``by_innovations`` where it foresees the rows better than what free runs found, else that one."""
+    """The outcome of ``by_innovations`` where it foresees the rows better than what free runs found, else that one.
+
+    What is known of the plant decides before any error. A model that was not fitted on all folds is compared with none.
+    """
     again = replace(rounds, budget=replace(rounds.budget, spent=0.0))
     try:
         other = by_innovations(again, orders, units)
     except ModelError:  # no filter follows the record
-        return found
-    spent = found.spent + other.spent
-    ahead = errors_ahead(rounds, other.chosen, found.chosen)
-    return replace(other if ahead.wanders else found, spent=spent, ahead=ahead)
+        return replace(found, spent=found.spent + again.budget.spent)
+    spent, one_step, free_runs = found.spent + other.spent, other.chosen, found.chosen
+    if one_step.folds != free_runs.folds:
+        return replace(found, spent=spent)
+    ahead = errors_ahead(rounds, one_step, free_runs)
+    better = ahead.wanders if one_step.against == free_runs.against else one_step.against < free_runs.against
+    return replace(other if better else found, spent=spent, ahead=ahead)
 
 
 def by_innovations(rounds: Rounds, orders: Sequence[int], units: Sequence[int]) -> Selection:

@@ -59,6 +59,10 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
         words = "linear is enough: its residual is as small as the noise, or no network could be trained"
     elif selection.refused:
         words = "linear: a network was chosen first, but the record does not prove its gains, and proves these"
+    elif network.against != selection.linear.against:
+        words = (
+            f"{'nonlinear' if selection.nonlinear else 'linear'}: the other kind contradicts what is known of the plant"
+        )
     elif selection.innovations is not None and not selection.nonlinear:
         where = "in closed loop" if selection.ahead is None else "in which loads wander"
         words = (
@@ -86,7 +90,9 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
         "drifts": selection.drifts,
         "noise": s.noise,
         "judged": _judged(selection),
-        "ahead": _ahead_figures(selection.ahead),
+        "ahead": None
+        if selection.refused
+        else _ahead_figures(selection.ahead, wanders=selection.innovations is not None),
         "rows_ahead": None if selection.innovations is None else PREDICTED_AHEAD,
         "row_convention": f"the MVs of a row act on the outputs of the {'same' if s.same_row else 'next'} row",
         "held_out_error": chosen.error,
@@ -100,11 +106,11 @@ def structure_figures(selection: Selection, unseen: Sequence[str] = ()) -> dict[
     }
 
 
-def _ahead_figures(found: ErrorsAhead | None) -> dict[str, Any] | None:
-    """Both errors, the rows that they look ahead, and whether a load wanders; None where nothing was compared."""
+def _ahead_figures(found: ErrorsAhead | None, *, wanders: bool) -> dict[str, Any] | None:
+    """Both errors, the rows that they look ahead, whether one-step errors chose; None where nothing was compared."""
     if found is None or not np.all(np.isfinite(found)):
         return None
-    return {**found._asdict(), "rows": PREDICTED_AHEAD, "wanders": found.wanders}
+    return {**found._asdict(), "rows": PREDICTED_AHEAD, "wanders": wanders}
 
 
 def _judged(selection: Selection) -> str:

@@ -27,7 +27,7 @@ FILTER_ITERATIONS = 20
 class ErrorsAhead(NamedTuple):
     """Scaled errors ``PREDICTED_AHEAD`` rows ahead, of the model that one-step errors chose, and of free runs' choice.
 
-    Infinite where no filter of a model follows the record.
+    Of several outputs the geometric mean. Infinite where no filter of a model follows the record.
     """
 
     one_step: float
@@ -52,16 +52,18 @@ def errors_ahead(rounds: Rounds, one_step: CandidateFits, free_runs: CandidateFi
 def error_ahead(problem: Problem, task: tuple[CandidateFits, int]) -> float:
     """Scaled error of a candidate's best fit over a fold's held-out rows, foreseen 1 to ``PREDICTED_AHEAD`` rows ahead.
 
-    A fit of free runs is given the loads, and the filter's gain that foresees its training rows best one row ahead.
-    Infinite where the filter explodes.
+    A fit of free runs is given the loads and a filter as those of one-step errors have it: its gain foresees the
+    training rows best one row ahead, and the held-out ones choose the iterate. Infinite where the filter explodes.
     """
     trial, fold = task
     model = trial.of_fold(fold)[0].model
-    held = problem.held(trial.structure, fold)
+    held = problem.in_a_loop.held(trial.structure, fold)
     if not isinstance(model, Innovations):
         train = problem.train(trial.structure, fold)
         try:
-            fitted = PredictionError(iterations=FILTER_ITERATIONS).fit(begun(model, train), train, gain_alone=True)
+            late = problem.held(trial.structure, fold)
+            fitter = PredictionError(iterations=FILTER_ITERATIONS)
+            fitted = fitter.fit(begun(model, train), train, late, gain_alone=True)
         except ModelError:
             return np.inf
         model = fitted.model

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import made_plants
 import numpy as np
@@ -78,6 +79,29 @@ def test_of_both_models_the_one_that_foresees_better_is_taken(monkeypatch: pytes
     assert taken[True].innovations is not None
     assert taken[False].innovations is None
     assert taken[True].spent == pytest.approx(taken[False].spent)  # both searches are counted
+
+
+@pytest.mark.parametrize("changed", ["against", "folds"])
+def test_what_is_known_comes_before_errors_and_all_folds_are_compared(
+    changed: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    search = structure_search.by_innovations
+
+    def worse(*given: Any) -> structure_search.Selection:
+        """The one-step choice, which contradicts what is known, or was fitted on the first fold alone."""
+        found = search(*given)
+        fits = {
+            key: replace(fit, against=frozenset({0})) if changed == "against" else fit
+            for key, fit in found.chosen.fits.items()
+            if changed == "against" or key[0] == 0
+        }
+        return replace(found, linear=CandidateFits(found.chosen.structure, fits), network=None)
+
+    monkeypatch.setattr(structure_search, "by_innovations", worse)
+    monkeypatch.setattr(structure_search, "errors_ahead", lambda *_: ErrorsAhead(0.1, 0.2))
+    found = PART.groundwork().done(Source(with_load(1.5), SOURCE_SIGNALS), "search").selection
+    assert found.innovations is None
+    assert (found.ahead is None) is (changed == "folds")
 
 
 def test_error_ahead_of_a_free_run_is_that_of_the_best_filter_about_its_plant() -> None:
