@@ -177,7 +177,7 @@ def by_free_runs(
 def _beside_loads(rounds: Rounds, found: Selection, orders: Sequence[int], units: Sequence[int]) -> Selection:
     """The outcome of ``by_innovations`` where it foresees the rows better than what free runs found, else that one.
 
-    What is known of the plant decides before any error. A model that was not fitted on all folds is compared with none.
+    Knowledge of the plant decides before any error. A model that was not fitted on all folds is compared with none.
     """
     again = replace(rounds, budget=replace(rounds.budget, spent=0.0))
     try:

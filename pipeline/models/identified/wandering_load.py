@@ -27,7 +27,7 @@ FILTER_ITERATIONS = 20
 class ErrorsAhead(NamedTuple):
     """Scaled errors ``PREDICTED_AHEAD`` rows ahead, of the model that one-step errors chose, and of free runs' choice.
 
-    Of several outputs the geometric mean. Infinite where no filter of a model follows the record.
+    The geometric mean over several outputs. Infinite where no filter of a model follows the record.
     """
 
     one_step: float
