@@ -51,7 +51,7 @@ GATE_WITH_MEASURED = {"held_out": 0.5, "held_out_noise": 0.2, LOADED: 0.1, MEASU
 
 
 LEAST_ASKED = 0.01
-"""Share of a range that set points go at least, where errors are counted in shares of it: none is divided by nothing."""
+"""Share of a range that set points go at least, where errors are shares of it: none is divided by nothing."""
 
 
 class OwnCase(OwnEnsemble):
