@@ -286,11 +286,8 @@ class Evidence:
         """The candidates that swing in no test without noise; all of them where each does."""
         if not self.case.on_models:
             return self._candidates
-        calm = {n: e for n, e in self._candidates.items() if not self._swings_by_itself(n)}
+        calm = {n: e for n, e in self._candidates.items() if not without_noise(self.laws[n].metrics.swings)}
         return calm or self._candidates
-
-    def _swings_by_itself(self, law: str) -> bool:
-        return bool(without_noise(self.laws[law].metrics.swings))
 
     @cached_property
     def _candidates(self) -> dict[str, float]:

@@ -142,7 +142,7 @@ class LawMetrics:
 
 
 def without_noise(tests: Mapping[str, Mapping[str, int]]) -> dict[str, Mapping[str, int]]:
-    """Those tests in which nothing but the loop itself keeps a swing up: noise moves any loop."""
+    """The tests in which nothing but the loop itself keeps a swing up: noise moves any loop."""
     return {test: seeds for test, seeds in tests.items() if not test.endswith(NOISE_SUFFIX)}
 
 

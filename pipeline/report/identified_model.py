@@ -19,7 +19,7 @@ from loopwright.pipeline.pictures.numbers import figure, number
 
 SCREENING = "screening.json"  # beside the record
 GONE = "the model explains the rest, no drift is left, and there is nothing to do"
-CARRIED = "a load that follows it; a tag that measures its cause as dv makes the model better"
+CARRIED = "The model has a load that follows it; a tag that measures its cause as dv makes the model better."
 FOLLOWED = (
     "a gain or a level that moves explains most of it: the plant drifts inside the record, and no model of these "
     "inputs can follow. Feedback corrects it; a tag that measures the cause as dv makes the model better"
@@ -40,17 +40,16 @@ def drift_answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...
     if data is None or replayed is None or not (path := data.with_name(SCREENING)).is_file():
         return ()
     report = read_json(path)
-    structure = part.get("structure") or {}
+    said, structure = _alarms(report), part.get("structure") or {}
+    if structure.get("rows_ahead") is not None:  # no run over all of these rows was made
+        return tuple(f"{said[cv.name]} {CARRIED}" for cv in evidence.case.plant_class.sp_signals if cv.name in said)
     drifts = bool(structure.get("drifts"))
     rows = max((row["settling_s"] for row in report["verdict"]["inputs"]), default=0.0) / report["period_s"]
     runs = [found for name in evidence.models if "free run" in (found := evidence.predictions(name))]
-    said, sentences = _alarms(report), []
+    sentences = []
     for i, cv in enumerate(evidence.case.plant_class.sp_signals):
         if cv.name in said:
             span = float(np.ptp(usual(replayed[0].pv[:, i])))
-            if structure.get("rows_ahead") is not None:
-                sentences.append(f"{said[cv.name]} The model has {CARRIED}.")
-                continue
             left = levels_of(runs[0]["measured"][:, i], runs[0]["free run"][:, i], span, int(rows)) if runs else None
             sentences.append(f"{said[cv.name]} {_answer(left, drifts)}")
     return tuple(sentences)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from own_cases import two_lags
 
-from loopwright.pipeline.report.identified_model import FOLLOWED, GONE, LEFT, drift_answers
+from loopwright.pipeline.report.identified_model import CARRIED, FOLLOWED, GONE, LEFT, drift_answers
 
 ROWS = 400
 SAID = "The screening said of y1: it wanders: what the inputs do not explain moves over 27 % of its span. "
@@ -27,7 +27,9 @@ def screening(folder: Path, tag: str) -> None:
     (folder / "screening.json").write_text(json.dumps(report))
 
 
-def answers(tag: str, left: float, *, drifts: bool = False, rows: int = ROWS) -> tuple[str, ...]:
+def answers(
+    tag: str, left: float, *, drifts: bool = False, rows: int = ROWS, ahead: int | None = None
+) -> tuple[str, ...]:
     """Of a free run that leaves a slow wave of ``left`` beside white noise."""
     case = two_lags()
     screening(Path("data/it"), tag)
@@ -36,7 +38,7 @@ def answers(tag: str, left: float, *, drifts: bool = False, rows: int = ROWS) ->
     wave = left * np.sin(np.arange(rows) / rows * 4 * np.pi)[:, None]
     found = {"measured": measured, "free run": measured - wave + rng.normal(0, 0.01, (rows, 2))}
     evidence: Any = SimpleNamespace(case=case, models={"identified": {}}, predictions=lambda _: found)
-    return drift_answers(evidence, {"structure": {"drifts": drifts}})
+    return drift_answers(evidence, {"structure": {"drifts": drifts, "rows_ahead": ahead}})
 
 
 @pytest.fixture(autouse=True)
@@ -52,6 +54,10 @@ def test_the_model_says_what_is_left_of_a_drift(left: float, drifts: bool, verdi
     percent = float(sentence.partition("leaves levels that move over ")[2].partition(" % of the span")[0])
     span = np.ptp(np.quantile(two_lags().record.pv[:, 1], [0.01, 0.99]))
     assert percent == pytest.approx(100 * 2 * left / span, rel=0.1, abs=1.0)
+
+
+def test_a_model_with_loads_has_no_free_run_to_tell_of() -> None:
+    assert answers("T1", 0.3, ahead=30) == (f"{SAID}{CARRIED}",)
 
 
 def test_each_of_several_tags_has_its_answer() -> None:
