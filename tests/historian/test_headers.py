@@ -19,12 +19,18 @@ from loopwright.pipeline.historian.files.headers import split_header
         ("FI-9 (m^3/h)", "FI-9", "m^3/h"),
         ("PI-3 (mbar)", "PI-3", "mbar"),
         ("QI-1 (kg/m2 s)", "QI-1", "kg/m2 s"),
+        ("TI-7 (C)", "TI-7", "C"),
+        ("42TIC204.PV (F)", "42TIC204.PV", "F"),
+        (r"\\PI\U42:E-204/Outlet.Temp (C)", r"\\PI\U42:E-204/Outlet.Temp", "C"),
     ],
 )
 def test_a_unit_in_brackets_is_no_part_of_the_tag(header: str, tag: str, unit: str) -> None:
     assert split_header(header) == (tag, unit)
 
 
-@pytest.mark.parametrize("header", ["FI-7 (raw)", "P-101 (A)", "TIC-7.PV (1)", "Level (north side)", "FI-7 ()", "FI-7"])
+@pytest.mark.parametrize(
+    "header",
+    ["FI-7 (raw)", "P-101 (A)", "Tank 4 (C)", "TI-7 (A)", "TIC-7.PV (1)", "Level (north side)", "FI-7 ()", "FI-7"],
+)
 def test_other_brackets_are_part_of_the_tag(header: str) -> None:
     assert split_header(header) == (header, "")

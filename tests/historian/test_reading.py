@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -83,6 +84,18 @@ def test_a_date_whose_day_is_unclear_is_refused_and_a_format_helps(tmp_path: Pat
     with pytest.raises(RecordError, match=r"may be month/day or day/month; give --time-format"):
         read_export([path], NAMES)
     check(path, time_format="%m/%d/%Y %H:%M:%S")
+
+
+@pytest.mark.parametrize("form", ["%m/%d/%Y %I:%M:%S %p", "%d/%m/%y %H:%M:%S", "%m-%d-%Y %H:%M"])
+def test_one_of_the_forms_that_a_refusal_names_is_right(form: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    minute = {t: START_S + 60.0 * k for k, t in enumerate(DATA.time_s)}
+    path.write_text(text(stamp=lambda t: utc(form)(minute[t])))
+    with pytest.raises(RecordError) as refused:
+        read_export([path], NAMES)
+    named = re.findall(r"'(%[^']+)'", str(refused.value))
+    assert form in named
+    check(path, time_s=np.array([*minute.values()]), time_format=form)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "latin-1"])

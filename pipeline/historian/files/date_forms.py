@@ -179,7 +179,7 @@ def form_of(texts: Sequence[str], where: str) -> str:
         return ""
     # What is zero may be left out, so that the longest form has all parts.
     tail = max((t for t, n in tails.items() if n >= SOME * len(own)), key=len)
-    order = ("%d", "%b", "%Y" if len(own[0]["c"]) == 4 else "%y") if named else _order(own, texts[0], where)
+    order = ("%d", "%b", "%Y" if len(own[0]["c"]) == 4 else "%y") if named else _order(own, texts[0], tail, where)
     order = ("%Y", "%b", "%d") if named and len(own[0]["a"]) == 4 else order
     return sign.join(order) + tail
 
@@ -272,8 +272,8 @@ def _tail(rest: str) -> str | None:
     return match["gap"] + match["sign"].join(clock) + part + half + zone
 
 
-def _order(found: Sequence[re.Match[str]], first: str, where: str) -> tuple[str, ...]:
-    """The order of day, month and year of dates with one sign between them."""
+def _order(found: Sequence[re.Match[str]], first: str, tail: str, where: str) -> tuple[str, ...]:
+    """The order of day, month and year of dates with one sign between them; ``tail`` is the form of what follows."""
     sign, long_year = found[0]["sign"], len(found[0]["c"]) == 4
     if len(found[0]["a"]) == 4:
         return "%Y", "%m", "%d"
@@ -290,10 +290,11 @@ def _order(found: Sequence[re.Match[str]], first: str, where: str) -> tuple[str,
     if len(orders) > 1:
         orders = _steady(numbers, orders)
     if len(orders) != 1:
-        what, forms = ("month/day or day/month", "'%d/%m/%Y %H:%M:%S'") if {*orders} <= {"dmy", "mdy"} else (
-            "day or year first", "'%y-%m-%d %H:%M:%S'")  # fmt: skip
+        what = "month/day or day/month" if {*orders} <= {"dmy", "mdy"} else "day or year first"
+        forms = [sign.join("%Y" if p == "%y" and long_year else p for p in ORDERS[o]) + tail for o in orders]
         raise RecordError(
-            f"{where}: {first!r} may be {what}; give --time-format, for example {forms}, or export ISO-8601 times"
+            f"{where}: {first!r} may be {what}; give --time-format {' or '.join(map(repr, forms[:2]))}, or export "
+            "ISO-8601 times"
         )
     order = ORDERS[orders[0]]
     return tuple("%Y" if part == "%y" and long_year else part for part in order)

@@ -16,6 +16,8 @@ BASES = (
 )
 ONE = rf"[kmµuMGcdh]?(?:{BASES})(?:[²³0-9]|\^-?[0-9])?"
 UNIT = re.compile(rf"^{ONE}(?:[/*·.\s]?{ONE})*$")
+TEMPERATURES = {"C", "F", "K"}  # letters that are units behind the name of a temperature, as of TI-7 or Outlet.Temp
+OF_TEMPERATURE = re.compile(r"temp|(?:^|[^a-z])t[icrjxe]*[-_ ]?\d", re.IGNORECASE)
 
 SPELLINGS = {
     "ns": (1e-9, "ns nsec nanosecond nanoseconds nanosekunde nanosekunden"),
@@ -72,7 +74,7 @@ def split_header(column: str) -> tuple[str, str]:
     """(tag, unit) of a header: of ``TIC-7.PV [degC]``, ``TIC-7.PV (°C)``; the unit is empty where none is written.
 
     The last square bracket holds the unit, unless it is a number, as of ``TIC[1]``. Round brackets hold one only
-    where they look like one: ``FI-7 (raw)`` is a tag, and ``P-7 (A)`` a pump.
+    where they look like one: ``FI-7 (raw)`` is a tag, and ``P-7 (A)`` a pump; ``TI-7 (C)`` is in degrees Celsius.
     """
     column = " ".join(column.split())
     square = SQUARE.match(column)
@@ -81,7 +83,10 @@ def split_header(column: str) -> tuple[str, str]:
         return (column, "") if unit.isdecimal() else (square["name"], unit)
     match = ROUND.match(column)
     found = match["unit"].strip() if match else ""
-    if match is None or not UNIT.match(found) or (len(found) == 1 and found.isupper()):
+    letter = len(found) == 1 and found.isupper()
+    if letter and match is not None and found in TEMPERATURES and OF_TEMPERATURE.search(match["name"]):
+        letter = False
+    if match is None or not UNIT.match(found) or letter:
         return column, ""
     return match["name"], found
 
