@@ -282,8 +282,10 @@ def believed(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | N
     """The quick model of y (n,) from inputs u, (n,) each, for gain and settling; None where there is none.
 
     Noise in y pulls a pole at 1 below 1. So a model with the pole at 1 is taken where the plain one does not settle
-    and its free run is no better. A drift pulls the poles towards 1. So a model beside lines in time is taken where
-    it settles well within one line, and in less time or to another gain than the plain one.
+    and its free run is no better. A drift, a load or a gain that fades pulls the poles towards 1. So no pole at 1 is
+    taken where a model beside lines in time settles and its free run is better: an integrator does not settle beside
+    them either. And a model beside lines is taken where it settles well within one line, and in less time or to
+    another gain than the plain one; with less certainty where only it settles.
     """
     plain = fit_arx(y, u, run)
     if plain is None:
@@ -292,19 +294,23 @@ def believed(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> Linear | N
     level = fit_arx(y, u, run, integrates=True)
     ramps = [i for i in range(len(u)) if level is not None and level.ramps(i)]
     settles = any(plain.settling(i) for i in ramps)
+    besides = [model for knots in DRIFT_KNOTS if (model := fit_arx(y, u, run, slow=knots)) is not None]
+    rival = None
     if level is not None and ramps and not settles:
-        most = min(AS_GOOD_ERROR * error, INTEGRATOR_UNEXPLAINED * _motion(y, run))
-        if free_run_error(level, y, u, run) <= most:
+        of_level = free_run_error(level, y, u, run)
+        rival = next((m for m in besides if all(m.settling(i) for i in ramps)), None)
+        if rival is not None and free_run_error(rival, y, u, run) >= of_level:
+            rival = None
+        if rival is None and of_level <= min(AS_GOOD_ERROR * error, INTEGRATOR_UNEXPLAINED * _motion(y, run)):
             return replace(level, sure=True)
-    for knots in DRIFT_KNOTS:
-        beside = fit_arx(y, u, run, slow=knots)
-        if beside is None or not _within_lines(beside, len(plain.rows) / knots):
+    for beside in besides:
+        if not _within_lines(beside, len(plain.rows) / beside.slow):
             continue
         if not _differ(plain, beside):
             return replace(plain, sure=True)
         if free_run_error(beside, y, u, run) <= AS_GOOD_ERROR * error:
             return replace(beside, sure=True)
-    return plain
+    return plain if rival is None else rival
 
 
 def _within_lines(model: Linear, length: float) -> bool:

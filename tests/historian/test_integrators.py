@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from dirty_plant import Clean, screen_of, steps
 
+from loopwright.pipeline.historian.arx_model import believed
 from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.report.screening import sayings
@@ -80,3 +81,31 @@ def test_a_slow_plant_that_rests_has_a_gain(pole: float, tmp_path: Path) -> None
     (valve, _) = found.report.verdict.inputs
     assert not valve.rate
     assert valve.gain["TIC-101.PV"] == pytest.approx(RATE / (1 - pole), rel=0.15)
+
+
+def fading(seed: int, last: float) -> tuple[np.ndarray, np.ndarray]:
+    """(y, u) (6000,) of a cooler: a gain that falls with the valve, three lags, and a load that wanders.
+
+    All of the answer is ``last`` times as large in the last row as in the first one.
+    """
+    random, n = np.random.default_rng(seed), 6000
+    holds = random.integers(20, 150, n)
+    u = np.repeat(random.uniform(15, 85, n), holds)[:n].round(1)
+    y, load, lags = np.zeros(n), 0.0, np.zeros(3)
+    for k in range(n):
+        y[k] = lags[2] + 0.3 * random.standard_normal()
+        load = 0.995 * load + 0.27 * random.standard_normal()
+        w = u[max(k - 5, 0)] / 100
+        steady = load - 80 * (1 + (last - 1) * k / n) * w / (w + 0.35)
+        lags += (np.array([steady, *lags[:2]]) - lags) * [0.08, 0.18, 0.28]
+    return y, u
+
+
+@pytest.mark.parametrize("last", [1.0, 0.6, 0.5])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_gain_that_changes_in_the_record_is_no_integrator(seed: int, last: float) -> None:
+    y, u = fading(seed, last)
+    model = believed(y, [u], np.zeros(len(y), dtype=np.int64))
+    assert model is not None
+    assert not model.integrates
+    assert -0.9 < model.step_response(0)[-1] < -0.2
