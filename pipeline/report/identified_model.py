@@ -119,8 +119,14 @@ def model_section(evidence: Evidence) -> ModelSection | None:
     if not part:
         return None
     mvs = [s.name for s in evidence.case.plant_class.mv_signals]
-    verdicts = (*_verdicts(part), *drift_answers(evidence, part), *_left_open(part, mvs), *_dead_times(evidence, part))
-    sentences = (*verdicts, *_noisy_disturbances(evidence, part), *_asked(evidence), *_one_side(evidence))
+    verdicts = (*_verdicts(part), *drift_answers(evidence, part), *_trends(evidence, part), *_left_open(part, mvs))
+    sentences = (
+        *verdicts,
+        *_dead_times(evidence, part),
+        *_noisy_disturbances(evidence, part),
+        *_asked(evidence),
+        *_one_side(evidence),
+    )
     structure = part.get("structure") or {}
     judged, rows = str(structure.get("judged") or "free run"), structure.get("rows_ahead")
     predicted = FREE_RUN if rows is None else (
@@ -157,6 +163,24 @@ def _wandering(structure: Mapping[str, Any]) -> str:
         return f"{words}: the model of free runs stays"
     return (
         f"{words}: the model with loads is taken. If the plant has changed since the record began, its gains are means"
+    )
+
+
+def _trends(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
+    """The gains that changed for certain while the record was taken."""
+    plant, gains = evidence.case.plant_class, part.get("gains") or {}
+    pairs = [
+        (pv, mv, (gains.get(pv.name) or {}).get(mv.name) or {}) for pv in plant.sp_signals for mv in plant.mv_signals
+    ]
+    return tuple(
+        f"The gain of {pv.name} by {mv.name} {'fell' if of['trend']['change'] < 0 else 'rose'} by "
+        f"{abs(100 * of['trend']['change']):.0f} ± {100 * of['trend']['sd']:.0f} % of the model's while the record was "
+        f"taken: to {axis_label(number(of['trend']['at_end']), gain_unit(pv, mv, bool(of.get('rate'))))} at its end, "
+        f"where the model has {number(of['gain'])}. Controllers are tuned on the model. If the plant stays as it is at "
+        "the end, add it once more without its first rows (--replace and --leave-out of `loopwright new`), as long as "
+        "what is left carries a model."
+        for pv, mv, of in pairs
+        if (of.get("trend") or {}).get("certain")
     )
 
 

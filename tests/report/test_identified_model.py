@@ -74,6 +74,20 @@ def test_both_kinds_of_model_are_told_where_a_load_wanders(
     assert (found.predicted != FREE_RUN) is wanders  # the figures of the table are of that kind too
 
 
+@pytest.mark.parametrize("certain", [True, False])
+def test_a_gain_that_changed_is_told_with_its_last_value(
+    certain: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    trend = {"change": -0.51, "sd": 0.1, "certain": certain, "at_end": 0.3725}
+    part = {**PART, "gains": {"y0": {"u0": gain("+", 1.4) | {"trend": trend}}}}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    told = [line for line in found.verdicts if all(figure in line for figure in ("51", "10", "0.372", "0.5"))]
+    assert len(told) == int(certain)
+
+
 def test_every_variable_has_its_fit_and_its_residual(section: ModelSection) -> None:
     assert section.variables[0] == ("y0 [m]", "91.3 %", "0.1", "0.2, 0.1, –", "0.05", "50 %", "2 %")
     assert section.variables[1][1] == "the run explodes"

@@ -12,6 +12,7 @@ from loopwright.pipeline.config.known import NONE
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.candidates import on_all_rows, within_limits
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.gain_trend import GainTrend, gain_trends
 from loopwright.pipeline.models.identified.identified import Identified, assemble_model, noise_of
 from loopwright.pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
 from loopwright.pipeline.models.identified.knowledge import known_figures
@@ -178,6 +179,10 @@ class IdentifiedPart(Part):
         for pair in problem.known.pairs:
             if pair.input in problem.known.silent:
                 gain_table[pvs[pair.output].name][inputs[pair.input].name]["sign"] = NONE
+        for pv, row in zip(pvs, _trends(problem, selection), strict=False):  # no row where no filter follows
+            for mv, trend in zip(source.signals.mv, row, strict=True):
+                of = gain_table[pv.name][mv.name]
+                of["trend"] = trend._asdict() | {"certain": trend.certain, "at_end": trend.at_end * of["gain"]}
         said = {"known": known_figures(searched.known, gain_table, record)} if searched.known else {}
         metrics: dict[str, Any] = {
             "free_run_rmse": runs[pvs[0].name]["free_run_rmse"],
@@ -227,6 +232,12 @@ def _proof(
         return figures
     # A free run holds the loads that nobody measured, and says nothing of the model.
     return {"answers": figures["answers"], "one_step": foreseen(problem, chosen, list(runs), scales.y_scale)}
+
+
+def _trends(problem: Problem, selection: Selection) -> Sequence[Sequence[GainTrend]]:
+    """The trend of each output and MV by the linear model: a network takes a gain that fades for a curve."""
+    linear = selection.linear
+    return gain_trends(linear.of_fold(0)[0].model, problem.whole(linear.structure), problem.n_mv)
 
 
 def _likely(problem: Problem, selection: Selection, inputs: Sequence[Signal]) -> dict[str, Any]:
