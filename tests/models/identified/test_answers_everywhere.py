@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from finished import plant_of
 
+from loopwright.pipeline.dynamics.step_response import answers_after
 from loopwright.pipeline.evaluation.open_loop import first_answers, plant_answers
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
@@ -37,6 +38,23 @@ def late_two_by_two() -> Record:
         acting = np.array([[u[max(k - LATE[i, j], 0), j] for j in range(2)] for i in range(2)])
         x = POLES[:, None] * x + (1 - POLES[:, None]) * GAINS * acting
     return Record.of(made_plants.signals_of(2, 2), y, u)
+
+
+def four_lags(u: np.ndarray) -> np.ndarray:
+    """Four lags of six periods each, one behind the other, at rest under the first of the moves u (n,)."""
+    pole, x, y = np.exp(-1 / 6), np.full(4, u[0]), np.empty(len(u))
+    for k, move in enumerate(u):
+        y[k] = x[3]
+        x = pole * x + (1 - pole) * np.array([move, *x[:3]])
+    return y
+
+
+def lags_alone() -> Record:
+    """Lags that pass for dead time, without one."""
+    rng = np.random.default_rng(0)
+    u = made_plants.random_holds(rng, 2000, 60)
+    y = 20 + 0.5 * four_lags(u) + 0.1 * rng.normal(size=len(u))
+    return Record.of(made_plants.signals_of(1, 1), y[:, None], u[:, None])
 
 
 @dataclass(frozen=True)
@@ -67,10 +85,14 @@ def fitted(record: Record, size: int, truth: list[list[int]]) -> Fitted:
     return Fitted(learnt.model, learnt.metrics, signals, truth)
 
 
-@pytest.fixture(scope="module", params=["one", "two"])
+@pytest.fixture(scope="module", params=["one", "lags", "two"])
 def found(request: pytest.FixtureRequest) -> Fitted:
     if request.param == "one":  # four periods of dead time; a fifth through the second lag
         return fitted(made_plants.second_order(1000, delay=4), 1, [[6]])
+    if request.param == "lags":  # 1 by any change beyond rounding
+        after = int(answers_after(four_lags(np.r_[0.0, np.ones(200)])[2:]))  # the move acts from row 1 on
+        assert after > 3
+        return fitted(lags_alone(), 1, [[after]])
     return fitted(late_two_by_two(), 2, (LATE + 1).tolist())
 
 
