@@ -14,8 +14,15 @@ Array = NDArray[np.float64]
 # ------------------------------------------------------------------------------------------------ first answer
 # of the fastest change in a period, from which an output has answered, of step responses without noise; of its end, for
 # an inverse response. A lag that begins slowly, as the second of two, has not answered yet. Used by: the responses near
-# a plant's start (tuning of PIDs, suitability of laws), the dead time of an identified model
+# a plant's start (tuning of PIDs, suitability of laws), the first answers of an identified model (its law, its report,
+# its controllers' manifests and so their monitors), those of a plant in equations in manifests
 ANSWERED_CHANGE = 0.1
+# periods from where an input acts on, in which the fastest change is sought: as far as predictive control looks ahead.
+# A slow pole that a record leaves open would make a later one. Used by: all of these first answers
+ANSWER_PERIODS = 60
+# of the largest value of a response: all that is no rounding of simulated differences. Used by: the first answers near
+# a plant's start
+RESPONSE_ROUNDING = 1e-9
 # of the largest value of an impulse response that a high-order ARX estimated, for its errors are seen too. Used by: the
 # dead time that a linear candidate is offered, which its held-out error takes or refuses
 VISIBLE_CHANGE = 1 / 6
@@ -25,7 +32,8 @@ CV_ANSWERED = 1e-6
 # of a response's whole change, and not of a change in a period: so much of the answer has come. Used by: whether the
 # horizon of a predictive law reaches the first answer
 BEGUN = 0.01
-# of a controlled variable's range, a level too: all that is no rounding. Used by: the structural dead time of a plant
+# of a controlled variable's range, a level too: all that is no rounding. Used by: whether an MV moves a variable of a
+# plant in equations at all
 SEEN_CV_MOVE = 1e-6
 
 
@@ -59,6 +67,18 @@ def answers_after(y: Array, share: float = ANSWERED_CHANGE) -> NDArray[np.int64]
     The first of y (..., n) stands one period after the step. The dead time is one period less.
     """
     return first_change(np.diff(y, prepend=0.0), share) + 1
+
+
+def first_answer_within(y: Array, least: float, periods: int = ANSWER_PERIODS) -> int | None:
+    """Periods from the step to the first answer of one response y (n,); None where no value is beyond ``least``.
+
+        k = b + answers_after(y(b+1), ..., y(b + periods)),   b = min { k : |y(k+1)| > least }
+
+    ``least`` in the unit of y is all that is rounding. The fastest change is that of some ``periods`` from the first
+    one on: however long the dead time and the response, the answer is the same.
+    """
+    begins = int(first_beyond(np.abs(y), least)) if len(y) else 0
+    return begins + int(answers_after(y[begins : begins + periods])) if begins < len(y) else None
 
 
 # ------------------------------------------------------------------------------------------------ settling time

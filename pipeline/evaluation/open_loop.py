@@ -1,17 +1,18 @@
-"""Moves of the plant and of controllers in open loop: MVs that rest through a test, and the dead time of the plant."""
+"""Moves of the plant and of controllers in open loop: MVs at rest through a test, and first answers of the plant."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
-from loopwright.pipeline.dynamics.step_response import SEEN_CV_MOVE
+from loopwright.pipeline.dynamics.step_response import SEEN_CV_MOVE, first_answer_within
 from loopwright.pipeline.errors import PlantError, RecordError
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.metric import together
+from loopwright.pipeline.evaluation.model_evidence import identified_part
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario
@@ -142,37 +143,58 @@ def replay(law: Steps, record: Record, signals: Signals, ahead: int, *, same_row
     return Replay(time_s, sp, record.pv[rows, :n_sp], asked, done)
 
 
+# ------------------------------------------------------------------ the first answers, for the manifest and its monitor
 DEAD_TIME_MOVE = 0.1  # of an MV's range
-LONGEST_DEAD_TIME = 200  # samples
+ANSWER_RUN = 200  # samples that are simulated; a monitor counts as far
 
 
-def dead_times(plant: Simulator) -> list[int | None]:
-    """For each CV the first sample k >= 1 at which it answers a move at sample 0; None within LONGEST_DEAD_TIME.
+def first_answers(case: Case, models: Mapping[str, Any]) -> list[int | None]:
+    """Periods k from a move of the quickest MV to the first answer of each CV, None without one.
 
-    The plant is simulated from its start with and without a move of each MV, and the quickest MV counts. A plant
-    without dead time answers at k = 1.
+        k = 1 + dead time
+
+    An own plant has those of the model of its record, which its report and its laws have too. ``models`` is
+    metrics.json of the law's model set. A plant in equations has none, and is simulated, see ``plant_answers``; so is
+    a model whose figures lack first answers.
     """
-    found: list[int | None] = [None] * len(plant.sp_signals)
+    pairs: Mapping[str, Mapping[str, int | None]] = identified_part({"": models}).get("first_answers") or {}
+    plant = case.plant
+    if any(cv.name not in pairs for cv in plant.sp_signals):
+        return plant_answers(plant)
+    return [_soonest(pairs[cv.name].get(mv.name) for mv in plant.mv_signals) for cv in plant.sp_signals]
+
+
+def plant_answers(plant: Simulator) -> list[int | None]:
+    """For each CV the first sample k >= 1 at which it answers a move at sample 0; None within ANSWER_RUN.
+
+    The plant is simulated from its start with and without a move of each MV, and the quickest MV counts, see
+    ``first_answer_within``. A plant without dead time answers at k = 1.
+    """
+    x, mv = plant.start
+    found = []
     for i, signal in enumerate(plant.mv_signals):
-        x, mv = plant.start
         moved = np.array(mv, dtype=np.float64)
         moved[i] = _elsewhere(signal, float(mv[i]))
-        found = [_sooner(a, b) for a, b in zip(found, _answers(plant, x, mv, moved), strict=True)]
-    return found
+        found.append([first_answer_within(y, SEEN_CV_MOVE) for y in _course(plant, x, mv, moved)])
+    return [_soonest(of) for of in zip(*found, strict=True)]
 
 
-def _answers(plant: Simulator, x: Array, mv: Array, moved: Array) -> list[int | None]:
+def _course(plant: Simulator, x: Array, mv: Array, moved: Array) -> Array:
+    """Changes (n_cv, periods) of the CVs by a move of the MVs, in their ranges; they end where the plant has no state.
+
+    A move may carry a plant far from where its equations hold, long after it has answered.
+    """
     n, step, p = len(plant.sp_signals), plant.stepper(), plant.parameters()
     span = np.array([s.high - s.low for s in plant.pv_signals[:n]])
-    found: list[int | None] = [None] * n
     still, other = np.array(x, dtype=np.float64), np.array(x, dtype=np.float64)
-    for k in range(1, LONGEST_DEAD_TIME + 1):
-        still, other = step(still, mv, plant.dv_nominal, p), step(other, moved, plant.dv_nominal, p)
-        off = np.abs(plant.measure(other)[:n] - plant.measure(still)[:n]) / span
-        found = [k if a is None and d > SEEN_CV_MOVE else a for a, d in zip(found, off.tolist(), strict=True)]
-        if None not in found:
-            break
-    return found
+    rows = np.zeros((n, ANSWER_RUN))
+    for k in range(rows.shape[1]):
+        try:
+            still, other = step(still, mv, plant.dv_nominal, p), step(other, moved, plant.dv_nominal, p)
+        except PlantError:
+            return rows[:, :k]
+        rows[:, k] = (plant.measure(other)[:n] - plant.measure(still)[:n]) / span
+    return rows
 
 
 def _elsewhere(signal: Signal, value: float) -> float:
@@ -183,5 +205,5 @@ def _elsewhere(signal: Signal, value: float) -> float:
     return value + move if value <= signal.middle else value - move
 
 
-def _sooner(a: int | None, b: int | None) -> int | None:
-    return b if a is None else a if b is None else min(a, b)
+def _soonest(periods: Iterable[int | None]) -> int | None:
+    return min((k for k in periods if k is not None), default=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from loopwright.pipeline.dynamics.step_response import answers_after
+from loopwright.pipeline.dynamics.step_response import RESPONSE_ROUNDING, first_answer_within
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.plants.equations import EquationPlant
@@ -57,8 +57,9 @@ def _require_an_observation(law: type[ControlLaw], within: int, plant: Simulator
     for _ in range(SHORTEST_STEP_RUN):
         x = advance(x, moved)
         course.append(plant.measured(x))
-    answer = np.abs(np.diff(np.array(course), axis=1)[:, 0])  # (n, n_pv)
-    after = np.minimum(answers_after(answer.T), SHORTEST_STEP_RUN)
+    answers = np.diff(np.array(course), axis=1)[:, 0].T  # (n_pv, n)
+    rounding = RESPONSE_ROUNDING * np.abs(answers).max(axis=1)
+    after = [first_answer_within(y, least) or SHORTEST_STEP_RUN for y, least in zip(answers, rounding, strict=True)]
     if min(after) > within:
         found = ", ".join(f"{s.name} answers after {k}" for s, k in zip(plant.pv_signals, after, strict=True))
         raise LawError(

@@ -53,7 +53,7 @@ def _grid(rows: int, columns: int, **shared: Any) -> tuple[Canvas, list[list[Axe
 def step_responses_picture(evidence: Evidence) -> Canvas:
     """Answer of each controlled variable to a step of one unit of each input, with the band of all good fits."""
     responses = identified_part(evidence.models).get("step_responses")
-    dead: Mapping[str, float] = identified_part(evidence.models).get("dead_times") or {}
+    answers: Mapping[str, Any] = identified_part(evidence.models).get("first_answers") or {}
     if not responses:
         raise NotMeasuredError
     plant = evidence.case.plant_class
@@ -71,7 +71,7 @@ def step_responses_picture(evidence: Evidence) -> Canvas:
             axes.plot(time, middle, color=LAW, linewidth=1.4, label="their middle")
             axes.axhline(0.0, color="#888888", linewidth=0.7)
             axes.set_ylim(*_heights(middle, low, high))
-            waits = dead.get(signal.name, 0.0) * plant.period_s
+            waits = (((answers.get(cv.name) or {}).get(signal.name) or 1) - 1) * plant.period_s
             if waits:
                 axes.axvline(time[-1] * waits / (plant.period_s * found["periods"][-1]), color=PALETTE[0],
                              linewidth=0.9, linestyle=":", label="dead time")  # fmt: skip

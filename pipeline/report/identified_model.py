@@ -80,7 +80,6 @@ def _answer(left: Levels | None, drifts: bool) -> str:
 MOST_CANDIDATES = 12  # candidates in the table, the best first
 COLOURED = 0.05  # correlation of noise with that of the sample before, below which it counts as white
 NEAREST_ERROR = 1.1  # error over the noise: no model is nearer
-ANSWERING_SLOPE = 0.1  # of the steepest slope: from here on an output answers
 APART = 2  # periods between likely dead times from which on the report asks for the true one
 SIGNS = {"+": "+", "-": "−", "uncertain": "uncertain"}
 
@@ -229,7 +228,7 @@ def _dead_times(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
     if not wide:
         return ()
     spans = (
-        f"from {number(low)} to {number(high)} s of {name} (the model has {number(own)} s)"
+        f"from {number(low)} to {number(high)} s of {name} (the model delays it by {number(own)} s before its states)"
         for name, (own, low, high) in wide.items()
     )
     return (
@@ -311,7 +310,7 @@ def _variables(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, 
 
 def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
     plant, gains = evidence.case.plant_class, part.get("gains") or {}
-    proof = (part.get("proof") or {}).get("answers") or {}
+    proof, answers = (part.get("proof") or {}).get("answers") or {}, part.get("first_answers") or {}
     bent = (part.get("structure") or {}).get("hidden", 1) > 0
     rows = []
     for signal in plant.sp_signals:
@@ -319,13 +318,7 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
             found = (gains.get(signal.name) or {}).get(given.name)
             if found is None:
                 continue
-            curve = ((part.get("step_responses") or {}).get(signal.name) or {}).get(given.name)
-            dead = (part.get("dead_times") or {}).get(given.name)
-            # The points of a response may lie many periods apart; of a single output the model's dead time is exact.
-            alone = len(part.get("outputs") or ()) == 1
-            first = None if dead is None else dead + 1.0
-            if curve and (first is None or not alone):
-                first = answers_after(curve, dead or 0.0)
+            first = (answers.get(signal.name) or {}).get(given.name)
             varies = "turns its sign" if found["varies"] is None else f"× {number(found['varies'])}"
             over = f"{number(found['low'])} … {number(found['high'])}, {varies}"
             rows.append(
@@ -338,7 +331,7 @@ def _answers(evidence: Evidence, part: Mapping[str, Any]) -> tuple[tuple[str, ..
                     ),
                     _sign(found, ((proof.get(signal.name) or {}).get(given.name) or {})),
                     over if bent else "one gain: the model is linear",
-                    "–" if not first else number(first * plant.period_s),
+                    "–" if first is None else number(first * plant.period_s),
                 )
             )
     return tuple(rows)
@@ -349,31 +342,6 @@ def _sign(gain: Mapping[str, Any], answer: Mapping[str, Any]) -> str:
     if gain["sign"] == "uncertain" and answer.get("verdict") == "proven":
         return f"{SIGNS['+' if answer['model'] > 0 else '-']}, its end is open"
     return SIGNS.get(gain["sign"], gain["sign"])
-
-
-def answers_after(curve: Mapping[str, Any], dead: float = 0.0) -> float:
-    """Periods from the step to the first sample of a step response that differs by it: one more than the dead time.
-
-    The line through the first point beyond doubt, as steep as the response there or as it becomes next, begins one
-    sample before the answer. A point is beyond doubt where its slope is more than ANSWERING_SLOPE of the steepest, and
-    its value more than half of the steepest change in a period and than the band of the fits. It does not matter how
-    long the response is or whether it ends, and its points may lie several periods apart. Never earlier than after the
-    ``dead`` periods of the model; 0 where nothing answers.
-    """
-    at = np.array([curve["periods"][0] - 1, *curve["periods"]], dtype=np.float64)
-    size = np.array([0.0, *curve["middle"]])
-    width = np.array(curve["high"]) - np.array(curve["low"]) if "high" in curve else np.zeros(len(size) - 1)
-    slope = np.diff(size) / np.diff(at)
-    steep = np.abs(slope)
-    sure = (steep > ANSWERING_SLOPE * steep.max()) & (np.abs(size[1:]) > np.maximum(width, 0.5 * steep.max()))
-    if not sure.any():
-        return 0.0
-    k = int(sure.argmax())
-    later = np.maximum(slope[k + 1 : k + 3] * np.sign(size[k + 1]), 0.0)
-    flattens = max(later[0] - later[1], 0.0) if len(later) == 2 else 0.0  # a lag was steeper before
-    steepest = max(steep[k], (later[0] if len(later) else 0.0) + flattens)
-    begins = at[k + 1] - abs(size[k + 1]) / steepest
-    return float(max(min(begins + 1.0, at[k + 1]), np.floor(dead) + 1.0))
 
 
 def _tried(part: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:

@@ -30,7 +30,7 @@ from loopwright.pipeline.evaluation.law_evidence import (
     lock_up_text,
 )
 from loopwright.pipeline.evaluation.model_evidence import identified_part
-from loopwright.pipeline.evaluation.open_loop import dead_times, errors_at_rest, replay
+from loopwright.pipeline.evaluation.open_loop import errors_at_rest, first_answers, replay
 from loopwright.pipeline.evaluation.poor_laws import why_poor
 from loopwright.pipeline.evaluation.trials import Metrics, Trial, step_us, try_files
 from loopwright.pipeline.export.controller_file import with_evidence, withhold
@@ -132,7 +132,7 @@ def validate(name: str) -> None:
     evidence = _evidence(case, base, shipped, grounds_of(case, models, {"": metrics.reached}))
     if (analysis := metrics.forms[BASE].analysis) is not None:
         evidence["analysis"] = analysis.figures
-    evidence["dead_time_periods"] = dead_times(case.plant)
+    evidence["dead_time_periods"] = first_answers(case, models)
     if metrics.swings:
         evidence["swings"] = metrics.swings
     if metrics.beyond_reach:

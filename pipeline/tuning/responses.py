@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from loopwright.pipeline.dynamics.step_response import (
     EVEN,
     RAMP_SLOPE,
+    RESPONSE_ROUNDING,
     SETTLED_BAND,
     STILL_RESPONSE,
-    answers_after,
+    first_answer_within,
     late_distance,
     late_slope,
     ramp_delay,
@@ -126,10 +127,11 @@ class StepResponses:
     def answers_after(self, cv: int, mv: int) -> int:
         """Samples from the step to the first one at which the CV has answered: 1 without a dead time.
 
-        An answer is a change within a period of more than a tenth of the fastest. It is 1 of an MV that moves nothing.
+        An answer is a change within a period of more than a tenth of the fastest, see ``first_answer_within``. It is 1
+        of an MV that moves nothing.
         """
-        after = int(answers_after(self.y[cv, mv]))
-        return after if after <= self.y.shape[-1] else 1
+        y = self.y[cv, mv]
+        return first_answer_within(y, RESPONSE_ROUNDING * float(np.abs(y).max())) or 1
 
     def starts_inverse(self, cv: int, mv: int) -> bool:
         """Whether the response first goes the other way, by more than a tenth of its end."""

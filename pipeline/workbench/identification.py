@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -33,11 +34,14 @@ class Identification:
 
     @property
     def gains(self) -> pd.DataFrame:
-        """A row each pair: gain [PV/input], its spread, sign, lowest and highest gain, dead time [s]."""
-        dead = self.figures["dead_times"]
+        """A row each pair: gain [PV/input], its spread, sign, lowest and highest gain, dead time [s].
+
+        The dead time is the model's own, NaN where the input moves nothing.
+        """
+        first, period_s = self.figures["first_answers"], self.data.record.period_s
         rows = [
             {"pv": pv, "input": name, **{k: of[k] for k in ("gain", "spread", "sign", "low", "high")}}
-            | {"dead_time_s": dead[name] * self.data.record.period_s}
+            | {"dead_time_s": nan if (k := first[pv][name]) is None else (k - 1) * period_s}
             for pv, inputs in self.figures["gains"].items()
             for name, of in inputs.items()
         ]

@@ -104,7 +104,7 @@ def _shown(kept: Any) -> str:
 
 # ----------------------------------------------------------------------- how fast a loop is, and how long it is learnt
 SETTLE_SCANS, LEAST_SETTLE_SCANS, MOST_SETTLE_SCANS = 100, 20, 2000  # scans
-DEAD_SCANS, MOST_DEAD_SCANS = 2, 200  # scans
+ANSWER_SCANS, MOST_ANSWER_SCANS = 2, 200  # scans from a move to the first answer
 DAY_S, WEEK_S = 86_400.0, 7 * 86_400.0  # [s]
 LEARN_S = 3 * DAY_S  # that rests and blocks are learnt at least: loads of a fast plant need not be fast
 FINE_S = DAY_S  # that the fewest figures of a fast plant last at least
@@ -112,7 +112,10 @@ NOISE = "_noise"  # how the names of the validation's tests with noise end
 
 
 def settle_scans(m: Manifest) -> int:
-    """Scans of a settling time: the median over the evidence's tests without noise, which would hide it."""
+    """Scans of the loop's settling time: the median over the evidence's tests without noise, which would hide it.
+
+    It is that of the closed loop after a move of its set point, and not the plant's own after a step of an MV.
+    """
     rows = m.evidence.get("scenarios")
     known = {n: row for n, row in rows.items() if isinstance(row, dict)} if isinstance(rows, dict) else {}
     found = [row.get("settling") for name, row in known.items() if not name.endswith(NOISE)]
@@ -121,11 +124,14 @@ def settle_scans(m: Manifest) -> int:
     return min(max(scans, LEAST_SETTLE_SCANS), MOST_SETTLE_SCANS)
 
 
-def dead_times(m: Manifest) -> list[int]:
-    """Scans after which each controlled variable first answers a move: the evidence's; DEAD_SCANS if nobody knows."""
+def answer_scans(m: Manifest) -> list[int]:
+    """Scans after which each controlled variable first answers a move: the evidence's; ANSWER_SCANS if nobody knows.
+
+    It is 1 without a dead time, which ``dead_time_periods`` counts so too.
+    """
     told = m.evidence.get("dead_time_periods")
     known = told if isinstance(told, list) and len(told) == len(m.sp) else [None] * len(m.sp)
-    return [d if type(d) is int and 1 <= d <= MOST_DEAD_SCANS else DEAD_SCANS for d in known]
+    return [k if type(k) is int and 1 <= k <= MOST_ANSWER_SCANS else ANSWER_SCANS for k in known]
 
 
 def pooled(least: int, figure_s: float) -> tuple[int, int]:

@@ -223,11 +223,13 @@ class Swing(KeepsState):
         return float(np.mean(self.amplitudes)) if self.amplitudes else 0.0
 
 
-def harris_index(errors: Array, dead: int) -> float:
-    """Share of an error's variance that no controller could remove for the dead time of ``dead`` samples, 0 .. 1.
+def harris_index(errors: Array, first: int) -> float:
+    """Share of an error's variance that no controller could remove within its first answer, 0 .. 1.
 
-    With the autoregressive model A(q) e(k) = w(k) (Yule-Walker, ``ORDER``) and its impulse response f:
-    eta = var(w) sum_{i < dead} f(i)^2 / var(e). One is minimum variance; small: there is something to win.
+        eta = var(w) sum_{i < first} f(i)^2 / var(e)
+
+    with f the impulse response of the autoregressive model A(q) e(k) = w(k) (Yule-Walker, ``ORDER``). One is minimum
+    variance; small: there is something to win. A move shows after ``first`` samples, one more than the dead time.
 
     Source: Harris, "Assessment of control loop performance", Can. J. Chem. Eng. 67 (1989) 856; by AR models:
     Desborough and Harris, the same journal 70 (1992) 1186.
@@ -241,7 +243,7 @@ def harris_index(errors: Array, dead: int) -> float:
     a = np.linalg.solve(toeplitz, r[1:])
     noise = max(float(r[0] - a @ r[1:]), 0.0)
     f = [1.0]
-    for i in range(1, dead):
+    for i in range(1, first):
         f.append(sum(a[j] * f[i - 1 - j] for j in range(min(i, ORDER))))
     return float(min(noise * np.sum(np.square(f)) / r[0], 1.0))
 

@@ -20,8 +20,8 @@ from loopwright.serving.monitor.cusum import (
     TIME_S,
     WEEK_S,
     Chart,
+    answer_scans,
     blocks,
-    dead_times,
     number,
     pooled,
     settle_scans,
@@ -70,9 +70,10 @@ NEAR_REST = 0.02  # of a set point's range: a mean error beyond is no rest
 class Monitor:
     """Watches one controller in its loop.
 
-    ``observe`` takes a scan: bounded work and memory, and no content of it raises. The settling time of the validation
-    (the evidence's ``settling``, else ``SETTLE_SCANS``) says how long a period of rest is. It learns the normal from
-    the first periods in AUTO; ``loopwright.serving.monitor.verdicts`` says what each figure is held against.
+    ``observe`` takes a scan: bounded work and memory, and no content of it raises. The loop's settling time in the
+    validation (the evidence's ``settling``, else ``SETTLE_SCANS``) says how long a period of rest is. It learns the
+    normal from the first periods in AUTO; ``loopwright.serving.monitor.verdicts`` says what each figure is held
+    against.
 
     Parameters
     ----------
@@ -112,7 +113,7 @@ class Monitor:
         self.following = Following(m.mv, self.settle)
         self._commanded: Array | None = None  # at the scan before, where it was written
         self.harris = [Share(1, 20) for _ in m.sp]
-        self.dead_time = dead_times(m)
+        self.first_answers = answer_scans(m)
         self._window = [deque[float](maxlen=HARRIS_SCANS) for _ in m.sp]
         self.domain = m.info.index("in_domain") if "in_domain" in m.info else None
         self._mv_low = np.array([s.low for s in m.mv])
@@ -228,7 +229,7 @@ class Monitor:
         self.spread.add(log_mean_square(self._e2_sum / self._sp_span**2, self._n), time_s)
         for i, window in enumerate(self._window):
             if len(window) == HARRIS_SCANS:
-                self.harris[i].add(harris_index(np.array(window), self.dead_time[i]))
+                self.harris[i].add(harris_index(np.array(window), self.first_answers[i]))
                 window.clear()
         self._clear()
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from loopwright.pipeline.dynamics.step_response import (
     SLOPE_KEPT,
     answers_after,
+    first_answer_within,
     first_beyond,
     first_change,
     late_change,
@@ -87,6 +88,31 @@ def test_two_lags_answer_once_they_are_fast_enough(dead: int, gain: float):
 def test_a_response_that_does_not_move_has_no_answer():
     assert answers_after(np.zeros((2, 7))).tolist() == [8, 8]
     assert first_beyond(np.array([[0.0, 1.0, 3.0], [0.0, 0.0, 0.0]]), np.array([1.0, 0.0])).tolist() == [2, 3]
+
+
+@given(taus, dead_times, gains)
+def test_some_periods_of_a_lag_show_its_first_answer(tau: float, dead: int, gain: float):
+    y = gain * lag(tau, dead=dead)
+    assert first_answer_within(y, 1e-9 * abs(gain)) == dead + 1
+    assert first_answer_within(y[: dead + 1], 0.0) == dead + 1
+    assert first_answer_within(y[:dead], 0.0) is None
+
+
+@given(dead_times, st.integers(100, 1500))
+def test_a_ramp_and_an_inverse_response_answer_at_once_however_long_they_are(dead: int, n: int):
+    k = times(n, dead)
+    assert first_answer_within(-0.02 * k, 0.0) == dead + 1
+    inverse = 2 * (1 - 0.97**k) - 1.5 * (1 - 0.8**k)
+    assert inverse.min() < -0.2
+    assert first_answer_within(inverse, 0.0) == dead + 1
+
+
+@given(dead_times)
+def test_what_grows_for_ever_answers_as_in_its_first_periods(dead: int):
+    """A pole beyond 1 makes the last change the fastest, which would put off the answer with each period."""
+    y = 1.05 ** times(900, dead) - 1
+    assert first_answer_within(y, 0.0) == dead + first_answer_within(y[dead : dead + 60], 0.0)
+    assert answers_after(y) > dead + 700
 
 
 # --------------------------------------------------------------------------------------------------- late motion

@@ -79,7 +79,8 @@ def evidence(case: OwnCase) -> Any:
             s.name: {"gain": GAINS[i, j], "spread": 0.1, "rate": False, "sign": "-" if GAINS[i, j] < 0 else "+"}
             for j, s in enumerate(inputs)
         }
-    part = {"step_responses": responses, "dead_times": {s.name: 2.0 for s in inputs}, "gains": gains}
+    answers = {cv: {s.name: 3 for s in inputs} for cv in gains}
+    part = {"step_responses": responses, "first_answers": answers, "gains": gains}
     # Most residuals are tiny, some ten times as large: the ends of the histogram lie far out.
     residual = 1e-5 * np.random.default_rng(0).standard_t(2, (600, N_Y)).clip(-4.0, 14.0)
     arrays = {

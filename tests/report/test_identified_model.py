@@ -35,6 +35,7 @@ PART: dict[str, Any] = {
     "residual": {"y0": {"autocorrelated": 0.5, "input_correlated": 0.02}},
     "gains": {"y0": {"u0": gain("+", 1.4), "u1": gain("uncertain", None)}, "y1": {"u0": gain("-", 1.0, rate=True)}},
     "dead_times": {"u0": 3.0, "u1": 0.0},
+    "first_answers": {"y0": {"u0": 4, "u1": None}, "y1": {"u0": 7, "u1": 1}},
     "candidates_tried": [*(tried(0.1 * k, False) for k in range(1, 20)), tried(5.0, True), tried(None, False)],
 }
 
@@ -99,7 +100,7 @@ def test_an_answer_says_its_sign_and_how_sure_that_is(section: ModelSection) -> 
     assert signs == {("y0", "u0"): "+", ("y0", "u1"): "uncertain", ("y1", "u0"): "−"}
     assert "turns its sign" in section.answers[1][4]
     assert [row[2] for row in section.answers] == ["0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V]", "0.5 ± 0.3 [m/V a period]"]
-    assert [row[5] for row in section.answers] == ["4", "1", "4"]
+    assert [row[5] for row in section.answers] == ["4", "–", "7"]  # [s], as the period is 1 s
 
 
 @pytest.mark.parametrize(("hidden", "over"), [(0, {"one gain: the model is linear"}), (4, {"-0.1 … 0.9, × 1.4"})])
@@ -112,23 +113,6 @@ def test_a_linear_model_says_nothing_of_gains_over_the_range(
     found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
     assert found is not None
     assert {row[4] for row in found.answers} == over
-
-
-def test_of_a_single_output_the_models_own_dead_time_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The points of its response lie 16 periods apart: the line through them begins eight periods too late."""
-    monkeypatch.chdir(tmp_path)
-    curve = {"periods": [6, 22, 38, 54], "middle": [0.0, 0.19, 0.4, 0.48], "low": [0.0] * 4, "high": [0.1] * 4}
-    outputs = {"y0": PART["outputs"]["y0"]}
-    part = {
-        **PART,
-        "outputs": outputs,
-        "gains": {"y0": {"u0": gain("+", 1.4)}},
-        "step_responses": {"y0": {"u0": curve}},
-    }
-    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
-    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
-    assert found is not None
-    assert [row[5] for row in found.answers] == ["4"]
 
 
 @pytest.mark.parametrize(("high", "lines"), [(1.0, 0), (0.4, 1)])

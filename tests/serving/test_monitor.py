@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from loopwright.serving import Command, Controller, Manifest, Mode, Sample, Signal
 from loopwright.serving.monitor import Monitor
 from loopwright.serving.monitor.actuator_checks import ActuatorFaults
-from loopwright.serving.monitor.cusum import Chart, correlation, dead_times, run_limit, settle_scans, upper_scatter
+from loopwright.serving.monitor.cusum import Chart, answer_scans, correlation, run_limit, settle_scans, upper_scatter
 from loopwright.serving.monitor.loop_statistics import Foresight, Swing, harris_index
 from loopwright.serving.monitor.plant_drift import Answers, RestMap
 
@@ -346,12 +346,12 @@ def test_a_clock_that_is_set_changes_no_verdict() -> None:
     assert right.numbers() == wrong.numbers()
 
 
-def test_the_dead_time_is_the_evidence_s_and_two_where_nobody_knows() -> None:
+def test_the_first_answer_is_the_evidence_s_and_two_where_nobody_knows() -> None:
     m = manifest()
-    assert dead_times(m) == [2]
-    assert dead_times(replace(m, evidence={"dead_time_periods": [5]})) == [5]
+    assert answer_scans(m) == [2]
+    assert answer_scans(replace(m, evidence={"dead_time_periods": [5]})) == [5]
     for strange in ([None], [0], [1.5], [True], ["3"], [10_000], [1, 2], "x", None):
-        assert dead_times(replace(m, evidence={"dead_time_periods": strange})) == [2]
+        assert answer_scans(replace(m, evidence={"dead_time_periods": strange})) == [2]
 
 
 def test_a_settling_time_is_that_of_the_tests_without_noise() -> None:

@@ -124,6 +124,7 @@ def test_a_law_that_does_not_suit_the_plant_is_not_designed_and_the_report_says_
     # Each absolute error has its unit, in the page, the terminal's table and the file.
     assert "It is the best because no other law is shipped." in page
     pid = LawMetrics.read(Path("work/it/validation/pid/metrics.json"))
+    assert Controller(Path("artifacts/it/pid.onnx")).manifest.evidence["dead_time_periods"] == [5]
     (error,) = pid.development.values()
     worse = replace(pid, development=dict.fromkeys(pid.development, 2 * error))
     two = Evidence(all_cases()["it"], {}, {"pid": LawEvidence(pid, Path()), "worse": LawEvidence(worse, Path())}, {})

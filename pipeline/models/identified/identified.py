@@ -7,9 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from loopwright.pipeline.dynamics.step_response import answers_after
+from loopwright.pipeline.dynamics.step_response import ANSWER_PERIODS, answers_after
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.dynamics import Dynamics
@@ -172,22 +173,31 @@ def assemble_model(
         **known,
         "rest": rest,
         "rest_cov": rest_cov,
-        "dead": dead_periods(model, data)[:n_mv] + np.asarray(delays[:n_mv], dtype=np.float64),
+        "dead": dead_periods(pair_answers(model, data))[:n_mv] + np.asarray(delays[:n_mv], dtype=np.float64),
     }
     return Identified.from_arrays(config, arrays)
 
 
-def dead_periods(model: Dynamics, data: ScaledRecord, length: int = 60) -> Array:
-    """Fewest periods (n_v,) without an answer at any output to a small step of each input, at the centre of the data.
+def pair_answers(model: Dynamics, data: ScaledRecord) -> NDArray[np.int64]:
+    """Periods (n_v, n_y) from a small step of each input to the first answer of each output, at the centre of the data.
 
-    An answer is a change within one period of more than a tenth of the fastest one over ``length`` periods.
+    See ``answers_after``, over ANSWER_PERIODS. It is 1 without a dead time, ANSWER_PERIODS + 1 where nothing moves.
+    Delays of the inputs before the model are not in it.
     """
     middle = np.median(data.v, axis=0)
     start = central_map(model, data) @ np.concatenate([np.zeros(data.y.shape[1]), middle, [1.0]])
     size = 0.5 * data.v.std(axis=0)
-    response = step_responses(model, start, middle, size, length)[..., : data.y.shape[1]]
-    silent = answers_after(np.moveaxis(response, 1, -1)).min(axis=1) - 1
-    return np.where(silent < length, silent, 0).astype(np.float64)
+    response = step_responses(model, start, middle, size, ANSWER_PERIODS)[..., : data.y.shape[1]]
+    return answers_after(np.moveaxis(response, 1, -1))
+
+
+def dead_periods(answers: NDArray[np.int64]) -> Array:
+    """Fewest whole periods (n_v,) without an answer at any output, of ``pair_answers`` (n_v, n_y); 0 without answers.
+
+    theta_j = min_i k_ij - 1
+    """
+    silent = answers.min(axis=1) - 1
+    return np.where(silent < ANSWER_PERIODS, silent, 0).astype(np.float64)
 
 
 def step_responses(model: Dynamics, x: Array, v: Array, size: Array, length: int) -> Array:

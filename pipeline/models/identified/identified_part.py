@@ -34,7 +34,7 @@ from loopwright.pipeline.models.identified.structure import Cells, Problem, Stru
 from loopwright.pipeline.models.identified.structure_search import Searched, Selection, StructureSearch
 from loopwright.pipeline.models.identified.verdict import (
     STEP_SDS,
-    dead_times,
+    answer_figures,
     free_run_figures,
     gain_figures,
     gains,
@@ -192,7 +192,7 @@ class IdentifiedPart(Part):
             "outputs": runs,
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
             "gains": gain_table,
-            "dead_times": dead_times(bands, structure.delays, rows, inputs),
+            **answer_figures(fitted.model.plant, structure.delays, problem.data, pvs, inputs),
             "proof": _proof(searched, record, proven, runs, noise * scales.y_scale)
             | ({"sign_margin": dict.fromkeys(names[:n_cv], margin)} if np.isfinite(margin) else {})
             | said

@@ -1,4 +1,4 @@
-"""The verdict on an identified model: its structure, its free run, gains and dead times with bands."""
+"""The verdict on an identified model: its structure, its free run, gains and responses with bands, first answers."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.dynamics.step_response import STILL_CURVE, late_change, late_slope
+from loopwright.pipeline.dynamics.step_response import ANSWER_PERIODS, STILL_CURVE, late_change, late_slope
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.metrics import fit_percent
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
-from loopwright.pipeline.models.identified.identified import dead_periods, step_responses
+from loopwright.pipeline.models.identified.identified import dead_periods, pair_answers, step_responses
 from loopwright.pipeline.models.identified.innovations import PREDICTED_AHEAD, Innovations, ahead
 from loopwright.pipeline.models.identified.output_error import fit_starts
 from loopwright.pipeline.models.identified.parameter_uncertainty import spread
@@ -295,9 +295,23 @@ def response_figures(
     return table
 
 
-def dead_times(
-    members: Sequence[Dynamics], delays: Sequence[int], data: ScaledRecord, inputs: Sequence[Signal]
-) -> dict[str, float]:
-    """Dead time of each input [periods], the median over the members."""
-    dead = np.median([dead_periods(m, data) for m in members], axis=0) + np.asarray(delays)
-    return {signal.name: float(d) for signal, d in zip(inputs, dead, strict=True)}
+def answer_figures(
+    model: Dynamics, delays: Sequence[int], data: ScaledRecord, pvs: Sequence[Signal], inputs: Sequence[Signal]
+) -> dict[str, dict[str, Any]]:
+    """``first_answers`` [periods] of each PV to each input, and ``dead_times`` [periods] of each input.
+
+        k_ij = delay_j + k_ij(model),   theta_j = min_i k_ij - 1
+
+    They are the finished model's own, and ``dead`` of ``Identified`` holds the same dead times: the report, the
+    manifests of the controllers and so their monitors read these. A first answer is None where nothing moves.
+    """
+    answers = pair_answers(model, data)
+    late = np.asarray(delays)
+    first = [[int(k + late[j]) if k <= ANSWER_PERIODS else None for k in of] for j, of in enumerate(answers)]
+    named = [signal.name for signal in inputs]
+    return {
+        "first_answers": {
+            pv.name: {name: of[i] for name, of in zip(named, first, strict=True)} for i, pv in enumerate(pvs)
+        },
+        "dead_times": dict(zip(named, map(float, dead_periods(answers) + late), strict=True)),
+    }
