@@ -16,6 +16,7 @@ from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning import rules
+from loopwright.pipeline.tuning.calm_choice import CALM_COST, calmest
 from loopwright.pipeline.tuning.loop_search import DevelopmentLoops, Loops, calm, searched
 from loopwright.pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, gains_of, pairings
 from loopwright.pipeline.tuning.reduction import LagWithDeadTime, start_lags
@@ -32,10 +33,10 @@ DEVELOPMENT_HOLDS = (60, 400)  # least and most
 class TriedLoops:
     """Settings of each loop that a search tried, their cost, and what it is made of, over set points and loads.
 
-        E = (E_sp/E_sp* + E_load/E_load*)/2
+        E = max(E_sp/E_sp*, E_load/E_load*)
 
-    E* are the errors of the cheapest settings. Set points have by far the larger errors; so each part counts by what
-    it gains.
+    E* are the errors of the cheapest settings. The larger part counts: a set-point weight buys travel with the errors
+    at set points alone, and their mean with those under loads let them grow by a tenth.
     """
 
     loops: Loops
@@ -47,7 +48,7 @@ class TriedLoops:
     @property
     def error(self) -> float:
         """E, over that of the cheapest."""
-        return 0.5 * (self.set_points + self.loads)
+        return max(self.set_points, self.loads)
 
     def row(self) -> dict[str, float]:
         """What the settings gave, and their cost, by name."""
@@ -156,7 +157,10 @@ def require_numbers(params: Any) -> None:
 
 
 def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) -> TunedLoops:
-    """The cheapest numbers in closed loop over the plant and its variations, of the given or the best two pairings."""
+    """The calmest of the best numbers over the plant and its variations, of the given or the best two pairings.
+
+    The least cost decides among pairings, ``calmest`` among the numbers that were tried on the chosen one.
+    """
     responses = StepResponses.near_start(plant)
     low, high = plant.asked
     longest = max(HOLD_SETTLING_TIMES * responses.settling, HOLD_RANGE_CROSSINGS * responses.crossing(high - low))
@@ -164,32 +168,34 @@ def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) ->
     drawn = (params.development_seeds, params.development_set_points, hold)
     plants = [DevelopmentLoops.by_simulation(variation, *drawn) for variation in plant.variations()]
     percent = 100 / (signals.sp[0].high - signals.sp[0].low)
-    found: list[tuple[float, Loops, TunedPairing, CostedLoops]] = []
+    found: list[tuple[float, TunedPairing, CostedLoops]] = []
     weighted = params.criterion == "itae"
     given = given_pairs(params, signals)
     tables = dict(pairings(responses.share)[:2]) if given is None else {given: gains_of(responses.share, given)}
     for pairs, table in tables.items():
         costed = CostedLoops(plants, partial(law_of, pairs=pairs), weighted)
         processes = [responses.process(*pair) for pair in pairs]
-        best = searched(processes, signals.period_s, costed, params.given()[0], params.set_point_weight)
+        least, _ = searched(processes, signals.period_s, costed, params.given()[0], params.set_point_weight)
         gains = tuple(float(table[cv, cv]) for cv, _ in pairs)
-        found.append((*best, TunedPairing(pairs, gains, percent * best[0], weighted), costed))
+        found.append((least, TunedPairing(pairs, gains, percent * least, weighted), costed))
     # The first of equal ones: sorting keeps their order.
     found.sort(key=lambda row: row[0])
-    _, settings, chosen, costed = found[0]
+    _, chosen, costed = found[0]
+    tried = costed.tried(percent)
+    settings = calmest(tried).loops
     last = calm([responses.process(*pair) for pair in chosen.pairs], signals.period_s, settings)
-    several = tuple(row[2] for row in found) if len(chosen.pairs) > 1 else ()
-    return TunedLoops(settings, chosen.pairs, several, last, costed.tried(percent))
+    several = tuple(row[1] for row in found) if len(chosen.pairs) > 1 else ()
+    return TunedLoops(settings, chosen.pairs, several, last, tried)
 
 
 def tried_words(tried: Sequence[TriedLoops]) -> str:
     """The settings that a search tried, for the report."""
     return (
         f"{len(tried)} sets of settings were tried in closed loops over the plant, and over what it may be beside its "
-        "model, with set points and with loads; those of the least cost are taken. The cost is the mean error in % of "
-        "the range; where there is noise, the price of MV travel is in it. In the table the errors at set points and "
-        "under loads are over those of the cheapest settings, the error is their mean, and the travel is in % of the "
-        "MVs' range a sample."
+        "model, with set points and with loads. The errors at set points and under loads count over those of the "
+        "cheapest settings, and the error is the larger. The settings taken have the least travel among those within "
+        f"{100 * CALM_COST:.0f} % of the least error; travel is in % of the MVs' range a sample. The cost, which the "
+        "search lowers, is the mean error in % of the range; where there is noise, the price of MV travel is in it."
     )
 
 
