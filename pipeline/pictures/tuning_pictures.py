@@ -1,4 +1,4 @@
-"""What a search of a law's numbers tried: the loops' error over the MVs' travel."""
+"""The picture of all numbers that a law's search tried: the loops' error over the MVs' travel."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ CALM_COST = 0.05  # of the least error, that less travel may cost: a valve wears
 
 
 class LoopOutcome(Protocol):
-    """What closed loops gave with numbers that were tried."""
+    """The outcome of closed loops with numbers that were tried."""
 
     @property
     def error(self) -> float:

@@ -65,7 +65,7 @@ class BatchLoops:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopCosts:
-    """Of candidates for a law's numbers over s sequences: their cost, and what it is made of."""
+    """The cost of candidates for a law's numbers over s sequences, and what it is made of."""
 
     cost: Array  # (candidates,) in the unit of the first CV, infinite where a loop is not finite
     error: Array  # (candidates, s) mean absolute error, in the unit of the first CV

@@ -51,7 +51,7 @@ class TriedLoops:
         return max(self.set_points, self.loads)
 
     def row(self) -> dict[str, float]:
-        """What the settings gave, and their cost, by name."""
+        """The outcome of the settings, and their cost, by name."""
         return {n: getattr(self, n) for n in ("set_points", "loads", "travel", "error", "cost")}
 
 
