@@ -157,8 +157,7 @@ def in_words(tried: Sequence[TriedNumbers]) -> str:
         "set points and under loads, each over that with the first numbers, .05 for a travel of 1 % of the MVs' range "
         "a sample, and a little for numbers far from the first. Among those within "
         f"{100 * CALM_COST:.0f} % of the least cost without travel, those of the least travel are taken; a higher "
-        "`speed` moves more and errs less, as the "
-        "table shows."
+        "`speed` moves the MVs more and follows faster, and the picture shows the price of each."
     )
 
 
