@@ -45,6 +45,7 @@ from untouched import UNTOUCHED
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.laws import LAWS
 from loopwright.pipeline.laws.base import ControlLaw
+from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.plants.simulator import PerturbedPlant
 
 ROWS, CLOSED_ROWS = 8_000, 12_000
@@ -61,11 +62,12 @@ HEAD = (
 
 
 def pid_of(plant: OwnPlant) -> ControlLaw | None:
-    """The PID tuned on the true plant; None where it controls no such plant."""
-    pid = LAWS["pid"]
+    """The PID tuned on the true plant, of the least cost; None where it controls no such plant."""
     simulated = PerturbedPlant(plant, {}) if len(plant.mv_signals) == 1 else plant
     try:
-        return pid.design(pid.Params(), {}, plant.signals, simulated).eval()
+        found = PID.design(PID.Params(), {}, plant.signals, simulated)
+        # Calm settings err more: a law ahead of them would be ahead of less than a PID can do.
+        return PID(plant.signals, found.tried[0].loops, pairs=found.pairs).eval()
     except PipelineError as error:
         print(f"  {plant.name}: no PID: {error}", file=sys.stderr)
         return None

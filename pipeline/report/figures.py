@@ -13,6 +13,7 @@ from matplotlib.figure import Figure as Canvas
 from loopwright.pipeline.errors import ReportError
 from loopwright.pipeline.evaluation.case import Figure
 from loopwright.pipeline.evaluation.evidence import Evidence, NotMeasuredError
+from loopwright.pipeline.evaluation.law_evidence import BASE
 from loopwright.pipeline.evaluation.model_evidence import candidates, identified_part
 from loopwright.pipeline.pictures.drawing import STYLE, CasePicture, Draw, save
 from loopwright.pipeline.pictures.identified_pictures import free_run_picture, gains_picture, step_responses_picture
@@ -29,7 +30,8 @@ from loopwright.pipeline.pictures.model_pictures import (
     predictions_picture,
     replay_picture,
 )
-from loopwright.pipeline.pictures.words import scenario_name
+from loopwright.pipeline.pictures.tuning_pictures import TravelCurve, travel_picture
+from loopwright.pipeline.pictures.words import law_name, scenario_name
 from loopwright.pipeline.report.own_acceptance import shipped_laws, worst_test
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
@@ -51,8 +53,9 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
     The case's own figures are ``figure_05.png`` and so on, with the best controller added;
     ``closed_loop_<law>.png`` shows each law beside the case's baseline on the test that weighs most, and
     ``closed_loop.png`` the best one; ``worst_<law>.png`` the test that says most against it, ``cycle_<law>.png`` its
-    worst limit cycle; ``candidates_<set>_<part>.png`` the search over a model's size; ``closed_loop_test_<test>.png`` a
-    test that moves measured disturbances; ``own`` are the pictures that only this case has.
+    worst limit cycle, ``tuning_<law>.png`` the numbers that its search tried; ``candidates_<set>_<part>.png`` the
+    search over a model's size; ``closed_loop_test_<test>.png`` a test that moves measured disturbances; ``own`` are the
+    pictures that only this case has.
     Raises ReportError where two pictures have the same file name.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -87,6 +90,9 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
                 keep(f"cycle_{name}", *cycle_picture(evidence, name))
             with suppress(NotMeasuredError):
                 keep(f"replay_{name}", replay_picture(evidence, name), f"{title}, replayed over the record")
+            with suppress(NotMeasuredError):
+                curve = TravelCurve.of(law.analyses.get(BASE))
+                keep(f"tuning_{name}", travel_picture(curve, law_name(name)), curve.words(title))
         for test, sequences in evidence.tests.items():
             if sequences[0].dv is not None:
                 with suppress(NotMeasuredError):

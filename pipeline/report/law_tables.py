@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from loopwright.pipeline.evaluation.evidence import Evidence
-from loopwright.pipeline.evaluation.law_evidence import BASE
+from loopwright.pipeline.evaluation.law_evidence import BASE, FormAnalysis
 from loopwright.pipeline.evaluation.metric import TRAVEL, with_unit
 from loopwright.pipeline.pictures.words import given_text
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
+
+MOST_TRIED = 40  # rows of what a search tried, the cheapest: a PID's has over a hundred, and the picture shows all
 
 
 def law_row(evidence: Evidence, law: str) -> dict[str, Any]:
@@ -92,13 +94,23 @@ def analyses(evidence: Evidence) -> list[dict[str, Any]]:
                 "rows": [
                     (evidence.case.label(m), [analysis.figures.get(m) for analysis in forms.values()]) for m in metrics
                 ],
-                "tried": [list(row.values()) for row in shipped.table],
-                "columns": [evidence.case.label(name) for row in shipped.table[:1] for name in row],
+                **_tried(evidence, shipped),
                 # A note that all forms share names no form.
                 "notes": [(note, "" if len(own) == len(forms) else ", ".join(own)) for note, own in of.items()],
             }
         )
     return tables
+
+
+def _tried(evidence: Evidence, analysis: FormAnalysis) -> dict[str, Any]:
+    """Columns and rows of what a search tried, the first ``MOST_TRIED`` and the one that was taken, and their count."""
+    rows = [row for i, row in enumerate(analysis.table) if i < MOST_TRIED or row.get("taken")]
+    names = [name for name in (analysis.table[0] if analysis.table else ()) if name != "taken"]
+    return {
+        "columns": [evidence.case.label(name) for name in names],
+        "tried": [{"taken": bool(row.get("taken")), "values": [row[name] for name in names]} for row in rows],
+        "tried_count": len(analysis.table),
+    }
 
 
 def _row(evidence: Evidence, name: str, title: str, metric: str) -> dict[str, Any]:

@@ -125,6 +125,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "late": [words for law in shipped if (words := dead_time_to_state(evidence, law))],
         "further": further_figures(evidence),
         "analyses": analyses(evidence),
+        "tuning_pictures": of_kind("tuning_"),
         "bound_notes": _bound_notes(evidence),
         "bounded": any(evidence.bound(name) is not None for name in evidence.scenarios),
         "models": models,

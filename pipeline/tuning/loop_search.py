@@ -64,6 +64,15 @@ class BatchLoops:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LoopCosts:
+    """The cost of candidates for a law's numbers over s sequences, and what it is made of."""
+
+    cost: Array  # (candidates,) in the unit of the first CV, infinite where a loop is not finite
+    error: Array  # (candidates, s) mean absolute error, in the unit of the first CV
+    travel: Array  # (candidates, s) of the MVs [% of their range a sample]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class DevelopmentLoops:
     """Sequences of set points, and of loads, over a nominal plant.
 
@@ -120,36 +129,36 @@ class DevelopmentLoops:
         rows = 2 * len(seeds)
         return cls(plant, hold, sp, np.tile(x0, (rows, 1)), np.tile(mv0, (rows, 1)), load)
 
-    def error(self, step: LawStep, n_state: int, candidates: int = 1, *, time_weighted: bool = False) -> Array:
-        """Mean absolute error (candidates,) of each candidate over all sequences, in the unit of the first CV.
+    def run(self, step: LawStep, n_state: int, candidates: int = 1, *, time_weighted: bool = False) -> LoopCosts:
+        """Errors, travel and cost of each candidate over all sequences.
 
         ``time_weighted`` multiplies each error by the periods since its set point moved, which makes
         of the mean an ITAE: a slow or swinging end then counts for more than the unavoidable beginning.
         ``step`` takes shapes (candidates, s, .): a law whose numbers have a leading dimension
         of candidates. The error of a sample counts before that sample's move acts. A candidate
-        whose loop is not finite has an infinite error. Several CVs count in shares of their ranges, as their sum.
-        Where the plant has measurement noise, the law is given it, and the error counts ``MOVE_COST`` of the MVs'
-        travel, both in shares of their ranges.
+        whose loop is not finite has an infinite cost. Several CVs count in shares of their ranges, as their sum.
+        Where the plant has measurement noise, the law is given it, and the cost has the price ``MOVE_COST`` of the MVs'
+        travel beside the error, both in shares of their ranges.
         """
         n, s, n_cv = self.sp.shape
         plant, sd = self.plant, self.plant.noise_std
         noise = sd * coloured(np.random.default_rng(0).standard_normal((n, s, len(sd))), plant.noise_colour)
         spans = np.array([s.high - s.low for s in plant.sp_signals])
+        reach = np.array([s.high - s.low for s in plant.mv_signals])
         weights = spans[0] / spans
-        price = MOVE_COST * spans[0] / np.array([s.high - s.low for s in plant.mv_signals]) * bool(sd.any())
         lanes = (candidates, s)
         x0, mv0 = np.tile(self.x0, (candidates, 1)), np.tile(self.mv0, (candidates, 1, 1))
-        loops, error = BatchLoops(plant, step, n_state, lanes, x0, mv0), np.zeros(lanes)
+        loops, error, moved = BatchLoops(plant, step, n_state, lanes, x0, mv0), np.zeros(lanes), np.zeros(lanes)
         for k in range(n):
             pv = loops.measured()
             late = k % self.hold if time_weighted else 1
             error += late * np.abs(self.sp[k] - pv[..., :n_cv]) @ weights
             before = loops.mv
             loops.step(torch.from_numpy(self.sp[k]).expand(*lanes, n_cv), pv + noise[k], self._load(k))
-            if price.any():
-                error += (loops.mv - before).abs().numpy() @ price
-        total = error.mean(axis=1) / n
-        return np.where(np.isfinite(total), total, np.inf)
+            moved += (loops.mv - before).abs().numpy() @ (1 / reach)
+        price = MOVE_COST * spans[0] * bool(sd.any())
+        cost = (error + price * moved).mean(axis=1) / n
+        return LoopCosts(np.where(np.isfinite(cost), cost, np.inf), error / n, 100 * moved / (n * len(reach)))
 
     def _load(self, k: int) -> Array | None:
         return None if self.load is None else self.load[k]

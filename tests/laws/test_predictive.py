@@ -40,7 +40,6 @@ from loopwright.pipeline.laws.predictive.tuning import (
     FORGETS,
     TRAVEL_COST,
     TriedNumbers,
-    calmest,
     judged,
     searched,
     tuned,
@@ -49,6 +48,7 @@ from loopwright.pipeline.laws.predictive.tuning_loops import LOOPS, LoopErrors, 
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.static.mlp import MLP
 from loopwright.pipeline.plants.noise import noise_and_change
+from loopwright.pipeline.tuning.calm_choice import CALM_COST, calmest
 from loopwright.serving import Controller
 from loopwright.serving.manifest import Signal
 
@@ -569,7 +569,8 @@ def test_the_cost_weighs_relative_errors_and_travel() -> None:
     )
     assert found[0].cost == 1.0
     assert found[1].cost == pytest.approx(0.5 + 0.5 * 3.0 / 2.0 + 3 * TRAVEL_COST)
-    assert found[1].row() == {"speed": 2.0, "set_points": 1.0, "loads": 1.5, "travel": 3.0, "cost": found[1].cost}
+    made = {"speed": 2.0, "set_points": 1.0, "loads": 1.5, "travel": 3.0, "error": 1.25, "cost": found[1].cost}
+    assert found[1].row() == pytest.approx(made)
 
 
 def test_laws_side_by_side_are_the_laws() -> None:
@@ -630,6 +631,9 @@ def test_a_searched_law_costs_no_more_than_the_given_one() -> None:
     assert len(table) == figures["tried"]
     assert [row["cost"] for row in table] == sorted(row["cost"] for row in table)
     assert table[0]["jumps"] == figures["jumps"]
+    (taken,) = [row for row in table if row["taken"]]
+    assert {n: taken[n] for n in ("speed", "caution", "jumps", "horizon", "cost")}.items() <= figures.items()
+    assert taken["error"] <= (1 + CALM_COST) * min(row["error"] for row in table)
     assert {row["jumps"] for row in table} > {1.0}
     assert not law_of(first_order()).analysis(None).figures
 

@@ -14,7 +14,8 @@ from identified_models import made_signals
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.pipeline.plants.simulator import Array, Simulator
-from loopwright.pipeline.tuning.loop_search import CALM_GAIN, DevelopmentLoops, calm, searched, simc
+from loopwright.pipeline.tuning.calm_choice import CALM_COST
+from loopwright.pipeline.tuning.loop_search import CALM_GAIN, MOVE_COST, DevelopmentLoops, calm, searched, simc
 from loopwright.pipeline.tuning.pairing import pairings, relative_gains
 from loopwright.pipeline.tuning.responses import FirstOrder, StepResponses
 from loopwright.pipeline.tuning.rules import PidSettings
@@ -252,10 +253,49 @@ def test_the_analysis_names_the_pairs_and_their_relative_gains() -> None:
     quick = {"development_seeds": (1,), "development_set_points": 2, "development_hold": 30}
     analysis = PID.design(PID.Params(**quick), {}, plant.signals, plant).analysis(plant)
     assert analysis.figures["relative_gain_y0"] == pytest.approx(1 / (1 - 0.25), rel=0.02)
-    settings, (pairs, why) = analysis.notes[:2], analysis.notes[2:]
+    settings, (_, pairs, why) = analysis.notes[:2], analysis.notes[2:]
     assert [note.split(":")[0] for note in settings] == ["u0 by y0", "u1 by y1"]
     assert "y0 by u0 (1.33)" in pairs
     assert "This is the only one" in why  # the others' relative gains are -0.33
+
+
+@pytest.mark.parametrize("plant", [lag(0.9, 2.0, 4), coupled(0.5)], ids=["one loop", "two loops"])
+def test_the_calmest_of_all_settings_that_the_search_tried_are_taken(plant: Simulator) -> None:
+    quick = {"development_seeds": (5,), "development_set_points": 2, "development_hold": 30}
+    law = PID.design(PID.Params(**quick), {}, plant.signals, plant)
+    analysis = law.analysis(plant)
+    assert len(analysis.table) > 50
+    assert np.isfinite([list(row.values()) for row in analysis.table]).all()
+    (taken,) = [row for row in analysis.table if row["taken"]]
+    assert analysis.figures.items() & taken.items() >= {(n, v) for n, v in analysis.figures.items() if "gain" not in n}
+    costs = [row["cost"] for row in analysis.table]
+    assert costs == sorted(costs)
+    cheapest = analysis.table[0]
+    assert (cheapest["set_points"], cheapest["loads"], cheapest["error"]) == (1.0, 1.0, 1.0)
+    within = (1 + CALM_COST) * min(row["error"] for row in analysis.table)
+    assert max(taken["set_points"], taken["loads"]) == taken["error"] <= within
+    assert taken["travel"] == min(row["travel"] for row in analysis.table if row["error"] <= within)
+    assert 0 < taken["travel"] < cheapest["travel"]
+
+
+def test_travel_is_the_moves_in_shares_of_the_range_and_noise_alone_has_a_price(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A law that steps its MV by a tenth of the range in each sample, up and down."""
+    plant = lag(0.9, 2.0)
+    loops = DevelopmentLoops.by_simulation(plant, (3,), 2, 10)
+
+    def swing(sp, pv, dv, mv_applied, state):
+        return torch.where(mv_applied > 0, mv_applied - 0.2, mv_applied + 0.2), state, mv_applied
+
+    quiet = loops.run(swing, 0)
+    np.testing.assert_allclose(quiet.travel, 10.0)  # % of -1..1
+    np.testing.assert_allclose(quiet.cost, quiet.error.mean(axis=1))
+    assert quiet.error.shape == quiet.travel.shape == (1, 2)
+    monkeypatch.setattr(Sampled, "noise_std", np.array([0.1]))
+    noisy = loops.run(swing, 0)
+    span = plant.sp_signals[0].high - plant.sp_signals[0].low
+    np.testing.assert_allclose(noisy.cost, noisy.error.mean(axis=1) + MOVE_COST * span * 0.1)
 
 
 def test_pairs_that_are_given_are_tuned_and_no_others() -> None:

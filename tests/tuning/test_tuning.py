@@ -245,7 +245,7 @@ def test_development_loops_start_at_rest(plant: EquationPlant) -> None:
     def hold(sp, pv, dv, mv_applied, state):
         return mv_applied, state, mv_applied
 
-    assert still.error(hold, 0, candidates=2).max() < 1e-6
+    assert still.run(hold, 0, candidates=2).cost.max() < 1e-6
 
 
 def test_time_weighted_errors_count_what_comes_late(plant: EquationPlant) -> None:
@@ -255,7 +255,7 @@ def test_time_weighted_errors_count_what_comes_late(plant: EquationPlant) -> Non
     def hold(sp, pv, dv, mv_applied, state):
         return mv_applied, state, mv_applied
 
-    plain, weighted = (loops.error(hold, 0, time_weighted=w)[0] for w in (False, True))
+    plain, weighted = (loops.run(hold, 0, time_weighted=w).cost[0] for w in (False, True))
     step = abs(loops.sp[6, 0, 0] - loops.sp[0, 0, 0])
     assert plain == pytest.approx(step / 2, rel=1e-3)
     assert weighted == pytest.approx(step / 2 * 2.5, rel=1e-3)  # mean of 0..5 over the hold with an error

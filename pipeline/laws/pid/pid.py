@@ -23,10 +23,12 @@ from loopwright.pipeline.laws.base import (
     stood_still,
 )
 from loopwright.pipeline.laws.pid.tuned import (
+    TriedLoops,
     by_simulation,
     given_pairs,
     linearization,
     require_numbers,
+    tried_words,
     tuned,
 )
 from loopwright.pipeline.models.base import Model
@@ -77,9 +79,10 @@ class PID(ControlLaw):
 
         ``tuning``: ``optimized`` chooses the IMC filter and the set-point weight in closed loop, by the
         ``criterion``, ``mae`` (mean absolute error) or ``itae`` (time-weighted); over a plant that is known by
-        simulation alone, and over one with several loops, it chooses all numbers; ``imc`` and ``simc`` use
-        ``lambda_s`` [s] (None: a robust value); ``itae`` is the minimum-ITAE rule for a set-point step;
-        ``manual`` uses ``kc`` [mv/pv], ``ti_s`` [s], ``td_s`` [s] and the derivative filter ``filter_s`` [s]; of
+        simulation alone, and over one with several loops, it chooses all numbers: the least MV travel among those that
+        were tried within 5 % of the least error; ``imc`` and ``simc`` use ``lambda_s`` [s] (None: a robust value);
+        ``itae`` is the minimum-ITAE rule for a set-point step; ``manual`` uses ``kc`` [mv/pv], ``ti_s`` [s], ``td_s``
+        [s] and the derivative filter ``filter_s`` [s]; of
         several loops it takes a list of these numbers, and of ``set_point_weight``, an entry for each of ``pairs``.
         ``pairs``: MV -> the CV that it holds, of several loops; None: pairs are chosen.
         ``tracking_s`` [s]: tracking time; None is sqrt(Ti Td). ``set_point_weight``: None is 1, or
@@ -147,6 +150,7 @@ class PID(ControlLaw):
     pairings: tuple[TunedPairing, ...] = ()  # of several loops, those that were tuned; the first is this law's
     pairs_given: bool = False
     calm: Loops | None = None  # settings of last resort, of a search
+    tried: tuple[TriedLoops, ...] = ()  # settings of a search on the pairs, the cheapest first
     mv_rate: Rates = None
 
     def __init__(
@@ -196,7 +200,7 @@ class PID(ControlLaw):
         found = tuned(params, models, signals, plant, partial(cls, signals, mv_rate=params.mv_rate))
         law = cls(signals, found.settings, params.mv_rate, found.pairs)
         law.examined_cv, law.pairings, law.pairs_given = params.examined_cv, found.pairings, params.pairs is not None
-        law.calm, law.mv_rate = found.calm, params.mv_rate
+        law.calm, law.tried, law.mv_rate = found.calm, found.tried, params.mv_rate
         return law
 
     @classmethod
@@ -253,11 +257,11 @@ class PID(ControlLaw):
         return None if self.calm is None else type(self)(self.signals, self.calm, self.mv_rate, self.pairs)
 
     def analysis(self, plant: Simulator | None) -> Analysis:
-        """The settings in words; stability and gain margin over ``examined_cv``; the pairs of several loops."""
+        """The settings in words; what a search tried; stability over ``examined_cv``; the pairs of several loops."""
         if self.pairings:
             return self._pairing()
         if self.examined_cv is None:
-            return Analysis(self._figures(), notes=self._in_words())
+            return Analysis(self._figures(), notes=self._in_words(), table=self._tried_rows())
         known = equations(plant, "law 'pid' with `examined_cv`")
         loops = FrozenLoops.of(known, self, self.n_state, np.linspace(*self.examined_cv, EXAMINED))
         radius = spectral_radius(loops.matrices())
@@ -271,18 +275,29 @@ class PID(ControlLaw):
         return Analysis(
             figures,
             notes=(*self._in_words(), *choice_words(chosen, others, cvs, self.signals.mv, given=self.pairs_given)),
+            table=self._tried_rows(),
         )
 
     def _figures(self) -> dict[str, float]:
         """Kc [MV/CV], Ti [s] and Td [s] of the loop, or of each by its MV; without an integral part there is no Ti."""
-        found: dict[str, float] = {}
-        for (_, j), s in zip(self.pairs, self.loops, strict=True):
-            of = f"_{self.signals.mv[j].name}" if len(self.pairs) > 1 else ""
-            found |= {f"kc{of}": s.kc} | ({f"ti_s{of}": s.ti_s} if isfinite(s.ti_s) else {}) | {f"td_s{of}": s.td_s}
-        return found
+        numbers = self._numbers(self.loops, "kc", "ti_s", "td_s")
+        return {name: value for name, value in numbers.items() if isfinite(value)}
+
+    def _numbers(self, loops: Loops, *names: str) -> dict[str, float]:
+        """These numbers of each loop, by name, and of several loops by their MVs too."""
+        rows = zip(self.pairs, loops, strict=True)
+        of = {f"_{self.signals.mv[j].name}" if len(self.pairs) > 1 else "": s for (_, j), s in rows}
+        return {f"{name}{mv}": float(getattr(s, name)) for mv, s in of.items() for name in names}
+
+    def _tried_rows(self) -> tuple[dict[str, float], ...]:
+        """The table of an analysis: each settings of the search, what they gave, and which are the law's."""
+        names = ("kc", "ti_s", "td_s", "filter_s", "set_point_weight")
+        return tuple(
+            self._numbers(c.loops, *names) | c.row() | {"taken": float(c.loops == self.loops)} for c in self.tried
+        )
 
     def _in_words(self) -> tuple[str, ...]:
-        """The settings of each loop, as somebody types them into another PID."""
+        """The settings of each loop, as somebody types them into another PID, and what a search tried."""
         words = []
         for (i, j), s in zip(self.pairs, self.loops, strict=True):
             cv, mv = self.signals.sp[i], self.signals.mv[j]
@@ -294,7 +309,7 @@ class PID(ControlLaw):
                 f"weight {s.set_point_weight:.4g}, anti-windup within {s.tracking_time_s:.4g} s "
                 f"(ideal form; derivative of the process variable); {forms.words(cv.unit, mv.unit)}."
             )
-        return tuple(words)
+        return (*words, tried_words(self.tried)) if self.tried else tuple(words)
 
 
 def _of(values: Tensor, which: Tensor | None) -> Tensor:

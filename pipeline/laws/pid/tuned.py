@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -15,6 +16,7 @@ from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.plants.steady import Linearization
 from loopwright.pipeline.tuning import rules
+from loopwright.pipeline.tuning.calm_choice import CALM_COST, calmest
 from loopwright.pipeline.tuning.loop_search import DevelopmentLoops, Loops, calm, searched
 from loopwright.pipeline.tuning.pairing import ONE_LOOP, Pairs, TunedPairing, gains_of, pairings
 from loopwright.pipeline.tuning.reduction import LagWithDeadTime, start_lags
@@ -28,16 +30,44 @@ DEVELOPMENT_HOLDS = (60, 400)  # least and most
 
 
 @dataclass(frozen=True, slots=True)
+class TriedLoops:
+    """Settings of each loop that a search tried, their cost, and what it is made of, over set points and loads.
+
+        E = max(E_sp/E_sp*, E_load/E_load*)
+
+    E* are the errors of the cheapest settings. The larger part counts: a set-point weight buys travel with the errors
+    at set points alone, and their mean with those under loads let them grow by a tenth.
+    """
+
+    loops: Loops
+    cost: float  # [% of the first CV's range], the price of travel in it
+    set_points: float  # over that of the cheapest
+    loads: float  # over that of the cheapest
+    travel: float  # [% of the MVs' range a sample]
+
+    @property
+    def error(self) -> float:
+        """E, over that of the cheapest."""
+        return max(self.set_points, self.loads)
+
+    def row(self) -> dict[str, float]:
+        """The outcome of the settings, and their cost, by name."""
+        return {n: getattr(self, n) for n in ("set_points", "loads", "travel", "error", "cost")}
+
+
+@dataclass(frozen=True, slots=True)
 class TunedLoops:
     """Settings of one loop, or of the loop of each pair; of several loops also the pairings that were tuned.
 
     The first of ``pairings`` is that of ``pairs``. ``calm`` stands for plants on which ``settings`` do not hold.
+    ``tried`` are the settings that a search tried on the pairs, the cheapest first.
     """
 
     settings: PidSettings | Loops
     pairs: Pairs = ONE_LOOP
     pairings: tuple[TunedPairing, ...] = ()
     calm: Loops | None = None  # of a search: settings of last resort
+    tried: tuple[TriedLoops, ...] = ()
 
 
 class LawOf(Protocol):
@@ -92,7 +122,7 @@ def tuned(
 
         def cost(rows: Sequence[PidSettings]) -> Array:
             law = law_of(list(rows))
-            return loops.error(law, law.n_state, len(rows), time_weighted=p.criterion == "itae")
+            return loops.run(law, law.n_state, len(rows), time_weighted=p.criterion == "itae").cost
 
         settings = rules.optimized_imc(AllPole.near(lin), signals.period_s, cost, given, optimize_weight=free)
         return TunedLoops(settings)
@@ -127,7 +157,10 @@ def require_numbers(params: Any) -> None:
 
 
 def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) -> TunedLoops:
-    """The cheapest numbers in closed loop over the plant and its variations, of the given or the best two pairings."""
+    """The calmest of the best numbers over the plant and its variations, of the given or the best two pairings.
+
+    The least cost decides among pairings, ``calmest`` among the numbers that were tried on the chosen one.
+    """
     responses = StepResponses.near_start(plant)
     low, high = plant.asked
     longest = max(HOLD_SETTLING_TIMES * responses.settling, HOLD_RANGE_CROSSINGS * responses.crossing(high - low))
@@ -135,26 +168,72 @@ def _searched(params: Any, signals: Signals, plant: Simulator, law_of: LawOf) ->
     drawn = (params.development_seeds, params.development_set_points, hold)
     plants = [DevelopmentLoops.by_simulation(variation, *drawn) for variation in plant.variations()]
     percent = 100 / (signals.sp[0].high - signals.sp[0].low)
-    found: list[tuple[float, Loops, TunedPairing]] = []
+    found: list[tuple[float, TunedPairing, CostedLoops]] = []
     weighted = params.criterion == "itae"
     given = given_pairs(params, signals)
     tables = dict(pairings(responses.share)[:2]) if given is None else {given: gains_of(responses.share, given)}
     for pairs, table in tables.items():
-
-        def cost(rows: Sequence[Loops], pairs: Pairs = pairs) -> Array:
-            law = law_of(list(rows), pairs=pairs)
-            each = [loops.error(law, law.n_state, len(rows), time_weighted=weighted) for loops in plants]
-            return np.asarray(np.mean(each, axis=0))
-
+        costed = CostedLoops(plants, partial(law_of, pairs=pairs), weighted)
         processes = [responses.process(*pair) for pair in pairs]
-        tried = searched(processes, signals.period_s, cost, params.given()[0], params.set_point_weight)
+        least, _ = searched(processes, signals.period_s, costed, params.given()[0], params.set_point_weight)
         gains = tuple(float(table[cv, cv]) for cv, _ in pairs)
-        found.append((*tried, TunedPairing(pairs, gains, percent * tried[0], weighted)))
+        found.append((least, TunedPairing(pairs, gains, percent * least, weighted), costed))
     # The first of equal ones: sorting keeps their order.
     found.sort(key=lambda row: row[0])
-    _, settings, best = found[0]
-    last = calm([responses.process(*pair) for pair in best.pairs], signals.period_s, settings)
-    return TunedLoops(settings, best.pairs, tuple(row[2] for row in found) if len(best.pairs) > 1 else (), last)
+    _, chosen, costed = found[0]
+    tried = costed.tried(percent)
+    settings = calmest(tried).loops
+    last = calm([responses.process(*pair) for pair in chosen.pairs], signals.period_s, settings)
+    several = tuple(row[1] for row in found) if len(chosen.pairs) > 1 else ()
+    return TunedLoops(settings, chosen.pairs, several, last, tried)
+
+
+def tried_words(tried: Sequence[TriedLoops]) -> str:
+    """The settings that a search tried, for the report."""
+    return (
+        f"{len(tried)} sets of settings were tried in closed loops over the plant, and over what it may be beside its "
+        "model, with set points and with loads. The errors at set points and under loads count over those of the "
+        "cheapest settings, and the error is the larger. The settings taken have the least travel among those within "
+        f"{100 * CALM_COST:.0f} % of the least error; travel is in % of the MVs' range a sample. The cost, which the "
+        "search lowers, is the mean error in % of the range; where there is noise, the price of MV travel is in it."
+    )
+
+
+class CostedLoops:
+    """The cost of settings in closed loops over a plant and its variations; it keeps what each of them gave."""
+
+    def __init__(
+        self, plants: Sequence[DevelopmentLoops], law_of: Callable[[list[Loops]], ControlLaw], time_weighted: bool
+    ) -> None:
+        self.plants, self.law_of, self.time_weighted = plants, law_of, time_weighted
+        self.given: dict[
+            Loops, tuple[float, ...]
+        ] = {}  # settings -> cost, errors at set points and under loads, travel
+
+    def __call__(self, rows: Sequence[Loops]) -> Array:
+        """The costs of candidates (candidates,), in the unit of the first CV."""
+        law = self.law_of(list(rows))
+        each = [p.run(law, law.n_state, len(rows), time_weighted=self.time_weighted) for p in self.plants]
+        cost, error, travel = (np.mean([getattr(e, n) for e in each], axis=0) for n in ("cost", "error", "travel"))
+        # Sequences of set points and of loads alternate.
+        figures = (cost, error[:, ::2].mean(axis=1), error[:, 1::2].mean(axis=1), travel.mean(axis=1))
+        self.given |= zip(rows, zip(*(values.tolist() for values in figures), strict=True), strict=True)
+        return np.asarray(cost)
+
+    def tried(self, percent: float) -> tuple[TriedLoops, ...]:
+        """All settings whose loops are finite, the cheapest first; costs times ``percent``."""
+        rows = sorted(((of, s) for s, of in self.given.items() if np.isfinite(of[0])), key=lambda row: row[0][0])
+        if not rows:
+            return ()
+        _, sp_least, loads_least, _ = rows[0][0]
+
+        def over(error: float, least: float) -> float:
+            return error / least if least else 1.0  # no load was drawn
+
+        return tuple(
+            TriedLoops(s, percent * cost, over(sp, sp_least), over(loads, loads_least), travel)
+            for (cost, sp, loads, travel), s in rows
+        )
 
 
 def by_simulation(params: Any, plant: Simulator) -> bool:

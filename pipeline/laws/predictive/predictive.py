@@ -22,13 +22,14 @@ from loopwright.pipeline.laws.predictive.params import (
     weights_of,
 )
 from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Cost, Planner, SetPointCourse, SoftLimits
-from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, calmest, in_words, tuned
+from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, in_words, tuned
 from loopwright.pipeline.laws.predictive.tuning_loops import TuningLoops
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.memory import AffineMap, Named
 from loopwright.pipeline.plants.noise import level_gain
 from loopwright.pipeline.plants.simulator import Signals, Simulator
+from loopwright.pipeline.tuning.calm_choice import calmest
 
 # Of the searched numbers, for a plant on which they do not hold:
 CALM_SPEED = 0.3  # moves weigh eleven times as much
@@ -238,8 +239,8 @@ class Predictive(ControlLaw):
         best, damping = calmest(self.tried), float(self.planner.damping)
         first = self.tried[0].cost
         figures = {**best.numbers, "damping": damping, "cost": best.cost, "cost_given": first, "tried": len(self.tried)}
-        rows = sorted(self.tried, key=lambda c: c.cost)
-        return Analysis(figures, notes=(in_words(self.tried), *self.remarks), table=tuple(c.row() for c in rows))
+        rows = [c.row() | {"taken": float(c is best)} for c in sorted(self.tried, key=lambda c: c.cost)]
+        return Analysis(figures, notes=(in_words(self.tried), *self.remarks), table=tuple(rows))
 
     @classmethod
     def check_settings(cls, params: Any, signals: Signals) -> None:

@@ -12,12 +12,12 @@ from loopwright.pipeline.engine.progress import steps
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.laws.predictive.tuning_loops import LoopErrors, side_by_side
+from loopwright.pipeline.tuning.calm_choice import CALM_COST, calmest
 
 TRAVEL_COST = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
 DEPARTURE_COST = 0.02  # of J: what a number that is e times as large as at first costs, or an e-th of it
 COARSE = [(s, c) for s in (0.5, 1.0, 2.0) for c in (0.4, 1.0, 2.5)]  # factors of speed and caution
 FINE = [(s, c) for s in (0.7, 1.0, 1.4) for c in (0.6, 1.0, 1.6)]
-CALM_COST = 0.05  # of the least error, that less travel may cost: a valve wears, and the model is not the plant
 HORIZONS = (0.7, 1.3)  # factors of the horizon that are tried
 JUMPS = (0.3, 0.1, 0.03)  # factors of the observer's jumps that are tried
 TRIED_DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
@@ -44,7 +44,7 @@ class TriedNumbers:
 
     def row(self) -> dict[str, float]:
         """Its numbers, what they gave, and its cost, by name."""
-        return {**self.numbers, **{n: getattr(self, n) for n in ("set_points", "loads", "travel", "cost")}}
+        return {**self.numbers, **{n: getattr(self, n) for n in ("set_points", "loads", "travel", "error", "cost")}}
 
 
 class Tries(Protocol):
@@ -69,15 +69,6 @@ def judged(outcome: LoopErrors, given: LoopErrors, numbers: Sequence[Numbers]) -
     travel = outcome.travel.mean(axis=-1)
     rows = zip(numbers, 0.5 * (sp + loads) + TRAVEL_COST * travel, sp, loads, travel, strict=True)
     return [TriedNumbers(dict(n), *map(float, figures)) for n, *figures in rows]
-
-
-def calmest(tried: Sequence[TriedNumbers]) -> TriedNumbers:
-    """The numbers of the least travel among those whose error is at most ``CALM_COST`` more than the least.
-
-    The travel is not in the limit: counted there too, it cost several times these 5 % on plants whose loads wander.
-    """
-    limit = (1 + CALM_COST) * min(c.error for c in tried)
-    return min((c for c in tried if c.error <= limit), key=lambda c: (c.travel, c.error))
 
 
 def searched(
@@ -166,8 +157,7 @@ def in_words(tried: Sequence[TriedNumbers]) -> str:
         "set points and under loads, each over that with the first numbers, .05 for a travel of 1 % of the MVs' range "
         "a sample, and a little for numbers far from the first. Among those within "
         f"{100 * CALM_COST:.0f} % of the least cost without travel, those of the least travel are taken; a higher "
-        "`speed` moves more and errs less, as the "
-        "table shows."
+        "`speed` moves the MVs more and follows faster, and the picture shows the price of each."
     )
 
 
