@@ -95,15 +95,17 @@ def controllers_of_a_lag(
     gain: float = 2.0,
     moved: tuple[float, float] = (-0.6, 0.6),
     noise: float = 0.01,
+    rows_a_hold: int = 10,
 ) -> OwnCase:
     """A lag in params.yaml, with a record, models that need no training, and these controllers of it.
 
-    The record's MV was ``moved`` between two values; ``noise`` is what the models say of the measurement.
+    The record's MV was ``moved`` between two values and held for ``rows_a_hold``; ``noise`` is what the models say of
+    the measurement.
     """
     poles = (0.6, 0.55, 0.65)
-    mv = np.repeat(np.random.default_rng(0).uniform(*moved, (40, 1)), 10, axis=0)
-    y = np.full((400, 1), gain * mv[0])
-    for k in range(399):
+    mv = np.repeat(np.random.default_rng(0).uniform(*moved, (40, 1)), rows_a_hold, axis=0)
+    y = np.full((len(mv), 1), gain * mv[0])
+    for k in range(len(mv) - 1):
         y[k + 1] = poles[0] * y[k] + (1 - poles[0]) * gain * mv[k]
     common = {"rest": np.eye(1, 3), "noise": np.array([noise])}
     lags = [scaled_model(1, 1, 0, 1, a=np.array([[p]]), b=np.array([[gain * (1 - p)]]), **common) for p in poles]

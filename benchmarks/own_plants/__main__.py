@@ -15,6 +15,8 @@ loop, and what the product makes of the file of a historian (``closed_benchmark.
 half that may be looked at while a method is chosen. 3 to 5 minutes of two cores a plant, with ``--fit`` 1 to 2.
 ``--observed PLANT ...``: what the NMPC reaches behind a Kalman filter, with the noise that a controller has
 (``observed.py``); some minutes a plant.
+``--cold PLANT ...``: how far from the record's MVs the predictive law asks for where it is started cold at rests of the
+record (``cold.py``); some minutes a plant.
 ``--refused [KIND ...]``: records of which no controller may come, and how many slip through (``closed_refused.py``).
 """
 
@@ -33,6 +35,7 @@ from closed_benchmark import PLANTS, closed_main
 from closed_development import CLOSED_DEVELOPMENT
 from closed_refused import KINDS, MINUTES, refused_main
 from closed_untouched import CLOSED_UNTOUCHED
+from cold import COLD_HEAD, COLD_ROWS, cold_row
 from development import DEVELOPMENT
 from further import FURTHER
 from loops import Score, scored
@@ -121,17 +124,23 @@ def main(argv: list[str]) -> int:
     add("--fit", action="store_true", help="of --closed: model and predictive law alone, no stages")
     add("--seed", type=int, default=0, help="of the records of --closed (0)")
     every = [*plants, *PLANTS]
+    add("--cold", nargs="*", choices=[*plants, *PLANTS], metavar="PLANT", help="laws started cold at rests (all)")
     add("--observed", nargs="*", choices=every, metavar="PLANT", help="the NMPC behind a filter instead (all)")
     add("--sequences", type=int, default=3, help="of the tests of --observed (3)")
     add("--refused", nargs="*", choices=[*KINDS], metavar="KIND", help=f"records to refuse: {', '.join(KINDS)} (all)")
     add("--count", type=int, default=20, help="of each kind of --refused (20)")
-    add("--minutes", type=float, default=MINUTES, help=f"of the search for a model of --refused ({MINUTES:g})")
+    add("--minutes", type=float, default=MINUTES, help=f"of a model's search, of --refused and --cold ({MINUTES:g})")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     if options.closed is not None:
         names = [n for name in options.closed or ["development"] for n in GROUPS.get(name, [name])]
         rows = options.rows or CLOSED_ROWS
         return closed_main(names, rows, fit=options.fit, seed=options.seed, pid_of=pid_of)
+    if options.cold is not None:
+        print(COLD_HEAD)
+        for name in options.cold or [*plants, *PLANTS]:
+            print(cold_row((plants | PLANTS)[name](), options.rows or COLD_ROWS, options.minutes), flush=True)
+        return 0
     if options.observed is not None:
         return observed_main([(plants | PLANTS)[name]() for name in options.observed or every], options.sequences)
     if options.refused is not None:

@@ -10,7 +10,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from loopwright.pipeline.cases.operating_range import OperatingRange, visited_mv
+from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT, OperatingRange, visited_mv
 from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_ARRAYS, MODEL_SET, Doubts, OwnPlant, doubted, suits
 from loopwright.pipeline.config.exports import is_exported
 from loopwright.pipeline.errors import ModelError, PlantError, RecordError
@@ -22,6 +22,7 @@ from loopwright.pipeline.files import read_json
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.records.record_file import RecordedSetPoints
+from loopwright.pipeline.records.recorded_rests import RecordedRest, rests_of
 from loopwright.pipeline.simulation.rests import answered
 
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
@@ -180,3 +181,8 @@ class OwnEnsemble(Case):
     def replayed(self) -> tuple[Record, int]:
         """The record, and the samples in which the slowest CV has half answered."""
         return self.record, self.reach.halfway
+
+    @cached_property
+    def recorded_rests(self) -> tuple[RecordedRest, ...]:
+        """Rests of the record, by the settling time of the law's model."""
+        return rests_of(self.record, self.reach.hold // ANSWERS_A_SET_POINT, self.reach.integrates)

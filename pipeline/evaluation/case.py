@@ -23,6 +23,7 @@ from loopwright.pipeline.metrics import rmse
 from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.records.recorded_rests import RecordedRest
 from loopwright.pipeline.simulation.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -244,6 +245,11 @@ class Case(ABC):
     def replayed(self) -> tuple[Record, int] | None:
         """The record over which laws are replayed, and the samples in which the plant half answers; None: no record."""
         return None
+
+    @property
+    def recorded_rests(self) -> tuple[RecordedRest, ...]:
+        """Rests of the plant's record, at which laws are started cold; none without a record."""
+        return ()
 
     def tests(self) -> dict[str, tuple[Scenario, ...]]:
         """``scenarios``; ParamsError if there are none, or if one of them has no sequence."""

@@ -80,6 +80,31 @@ class Cycle:
 
 
 @dataclass(frozen=True, slots=True)
+class ColdStart:
+    """Largest distances of the MVs that a law asks for, started cold at rests of the record, from the record's MVs.
+
+    In % of the MV's range: ``first`` at the first step, ``later`` at those after it. ``mv`` is the MV that is farthest
+    off, ``at`` the levels of PVs, MVs and measured disturbances at that rest. At a quarter of the rests no step is
+    farther off than ``quarter``. ``refused`` counts the rests at which the file refuses a step. Without ``rests``
+    in the record there are no distances.
+    """
+
+    rests: int
+    first: float | None = None
+    later: float | None = None
+    quarter: float | None = None
+    mv: str = ""
+    at: Mapping[str, float] = field(default_factory=dict)
+    refused: int = 0
+
+    @property
+    def farthest(self) -> float | None:
+        """The larger of both distances; None where no step was taken."""
+        known = [away for away in (self.first, self.later) if away is not None]
+        return max(known, default=None)
+
+
+@dataclass(frozen=True, slots=True)
 class LawMetrics:
     """metrics.json of one law, ``controllers.<case>-<name>``; this class alone writes and reads it.
 
@@ -94,7 +119,8 @@ class LawMetrics:
     worst limit cycle of the shipped file; ``poor``: why a law that locked up nowhere is not shipped, a clause after its
     name, and what to do; ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to
     their set point; ``calmed``: why the law's own numbers are not shipped, a clause after
-    its name, where calmer ones hold; all figures are then of these.
+    its name, where calmer ones hold; all figures are then of these; ``cold_start``: what the files ask for at rests of
+    the record, of a case on models.
     """
 
     name: str
@@ -118,6 +144,7 @@ class LawMetrics:
     poor: str = ""
     beyond_reach: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     calmed: str = ""
+    cold_start: ColdStart | None = None
 
     @property
     def why_withheld(self) -> str:

@@ -1,4 +1,4 @@
-"""Moves of the plant and of controllers in open loop: MVs at rest through a test, and first answers of the plant."""
+"""Plant and controllers in open loop: MVs at rest, replays, cold starts at rests of the record, first answers."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import numpy as np
 from loopwright.pipeline.dynamics.step_response import SEEN_CV_MOVE, first_answer_within
 from loopwright.pipeline.errors import PlantError, RecordError
 from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.law_evidence import ColdStart
 from loopwright.pipeline.evaluation.metric import together
 from loopwright.pipeline.evaluation.model_evidence import identified_part
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.pipeline.records.record import Record
+from loopwright.pipeline.records.recorded_rests import RecordedRest
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import simulate_closed
 from loopwright.serving.errors import LoopwrightError
@@ -141,6 +143,55 @@ def replay(law: Steps, record: Record, signals: Signals, ahead: int, *, same_row
             asked[i], state = np.nan, law.cold_state()
     time_s = record.period_s * np.arange(len(rows), dtype=np.float64)
     return Replay(time_s, sp, record.pv[rows, :n_sp], asked, done)
+
+
+# ---------------------------------------------------------------------- a law is started cold at rests of the record
+# samples at each rest: a law whose MV moves by little a period, or that finds a load by and by, is on its way by then
+COLD_STEPS = 10
+
+
+def cold_start(laws: Sequence[Steps], rests: Sequence[RecordedRest], signals: Signals) -> ColdStart:
+    """The MVs that laws ask for without a past at each rest of a record, beside those that held the plant there.
+
+        a_i(k) = 100 |mv_i(k) - u_i| / range_i   [%],   sp = pv = y,  dv = d,  mv_applied = u  at each k
+
+    with the levels y, d and u of a rest. The plant stays where it was, and the MV too, as in SHADOW. ``signals`` are
+    the law's. Rests whose set points or MVs lie outside of their ranges are left out: there a law asks for what its
+    range has. An MV of a few allowed values has no rest.
+    """
+    within = [rest for rest in rests if _within_ranges(rest, signals)]
+    span = np.array([s.high - s.low for s in signals.mv])
+    found, refused = list[tuple[Array, RecordedRest]](), 0
+    for law in laws:
+        for rest in within:
+            try:
+                found.append((100 * np.abs(_asked_cold(law, rest, signals) - rest.mv) / span, rest))
+            except LoopwrightError:
+                refused += 1
+    if not found:
+        return ColdStart(len(within), refused=refused)
+    away = np.stack([of for of, _ in found])  # (starts, COLD_STEPS, n_mv)
+    start, _, mv = np.unravel_index(int(away.argmax()), away.shape)
+    rest = found[int(start)][1]
+    groups = ((signals.pv, rest.pv), (signals.mv, rest.mv), (signals.dv, rest.dv))
+    at = {s.name: float(v) for group, levels in groups for s, v in zip(group, levels, strict=False)}
+    first, later = float(away[:, 0].max()), float(away[:, 1:].max())
+    quarter = float(np.quantile(away.max(axis=(1, 2)), 0.25))
+    return ColdStart(len(within), first, later, quarter, signals.mv[int(mv)].name, at, refused)
+
+
+def _within_ranges(rest: RecordedRest, signals: Signals) -> bool:
+    levels = zip((*signals.sp, *signals.mv), (*rest.pv[: len(signals.sp)], *rest.mv), strict=True)
+    return all(s.values is None and s.low <= level <= s.high for s, level in levels)
+
+
+def _asked_cold(law: Steps, rest: RecordedRest, signals: Signals) -> Array:
+    """MVs (COLD_STEPS, n_mv) that a law asks for at a rest."""
+    asked, state = np.empty((COLD_STEPS, len(signals.mv))), law.cold_state()
+    pv = rest.pv[: len(signals.pv)]
+    for k in range(COLD_STEPS):
+        asked[k], state, _ = law.step(sp=pv[: len(signals.sp)], pv=pv, dv=rest.dv, mv_applied=rest.mv, state=state)
+    return asked
 
 
 # ------------------------------------------------------------------ the first answers, for the manifest and its monitor

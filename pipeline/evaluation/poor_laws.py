@@ -8,18 +8,27 @@ from typing import Final
 import numpy as np
 
 from loopwright.pipeline.evaluation.evidence import Evidence
+from loopwright.pipeline.evaluation.law_evidence import ColdStart
 from loopwright.pipeline.evaluation.metric import gate_ratio
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
 CLEARLY: Final = 0.9  # of the error without control: a law that leaves more of it follows no set point
+# % of an MV's range that a cold start at a rest of the record may be off: valves are read to about 1 %, and laws of
+# linear models are off by less than .01 %
+COLD_NEAR: Final = 2.0
+# the same, at a quarter of the rests: a law that is farther off at three quarters of them rests elsewhere than the
+# plant. Networks hold loads by their slopes in the middle of the record: on six plants it was .3 to 8.4, on
+# those of linear models 0 (docs/benchmarks.md)
+COLD_FAR: Final = 10.0
 
 
 def why_poor(evidence: Evidence, law: str) -> str:
     """Why a law is not shipped although it locked up nowhere, and what to do; empty where nothing speaks against it.
 
     The first of: it ends in a limit cycle on a model that did not go wrong; it controls no better than no control; it
-    is worse than the old loop in every test. The evidence needs the figures of both laws alone.
+    is worse than the old loop in every test; started cold at a rest of the record, it asks for another MV than held the
+    plant there. The evidence needs the figures of both laws alone.
     """
     if figures := limit_cycle(evidence, law):
         return f"ends in a limit cycle ({figures}); give it calmer numbers, or its model better data"
@@ -27,6 +36,11 @@ def why_poor(evidence: Evidence, law: str) -> str:
         return f"controls no better than no control ({figures}); give it other numbers, or its MVs more room"
     if figures := worse_than_before_everywhere(evidence, law):
         return f"is worse than the old loop in every test ({figures}); give it other numbers"
+    if figures := far_at_a_rest(evidence.laws[law].metrics.cold_start):
+        return (
+            f"asks for another MV than the record's where it is started cold at its rests ({figures}); give its model "
+            "a measured disturbance that tells these rests from others, or rows of a step test around them"
+        )
     return ""
 
 
@@ -74,6 +88,30 @@ def worse_than_before_everywhere(evidence: Evidence, law: str) -> str:
     if not tests or len(evidence.worse_than_before(law)) < len(tests):
         return ""
     return _figures(evidence, law, ((test, evidence.figure(evidence.old_loop, test)) for test in tests), "before")
+
+
+def far_at_a_rest(found: ColdStart | None) -> str:
+    """The figures of a law that begins far from the record's MV at most of its rests, or refuses some; else empty.
+
+    At three quarters of the rests it is farther off than ``COLD_FAR``. One rest alone does not withhold a law: a model
+    is least exact where its record ends.
+    """
+    if found is None or not found.rests:
+        return ""
+    if found.refused:
+        return f"refused at {found.refused} of {found.rests} rests"
+    away = found.farthest
+    if away is None or found.quarter is None or found.quarter <= COLD_FAR:
+        return ""
+    return (
+        f"more than {found.quarter:.3g} % of its range off at three quarters of {found.rests} rests, {COLD_FAR:g} % is "
+        f"allowed; {found.mv} {away:.3g} % off at {rest_words(found)}"
+    )
+
+
+def rest_words(found: ColdStart) -> str:
+    """The levels of the rest at which a law is farthest from the record's MV: ``y 3.2, u 41``."""
+    return ", ".join(f"{name} {level:.4g}" for name, level in found.at.items())
 
 
 def _moves(evidence: Evidence, test: str) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
-from loopwright.pipeline.evaluation.law_evidence import FormAnalysis, Row
+from loopwright.pipeline.evaluation.law_evidence import ColdStart, FormAnalysis, Row
 from loopwright.pipeline.evaluation.metric import TRAVEL
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 
@@ -50,6 +50,7 @@ class LawResult:
     ``locked_up``: test -> data seed -> closed loops that locked up. ``as_printed``: a reproduction of a paper's
     law, which is shipped nevertheless. ``analysis``: by the form's name, ``base`` for the shipped one. ``swings``: as
     ``locked_up``, closed loops that swing to the end. ``withheld``: why it is not shipped, a clause after its name.
+    ``cold_start``: how far from the record's MVs it begins at rests of the record, of a case on models.
     """
 
     seeds: int
@@ -60,6 +61,7 @@ class LawResult:
     analysis: Mapping[str, FormAnalysis] = field(default_factory=dict)
     swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     withheld: str = ""
+    cold_start: ColdStart | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,10 +11,11 @@ import numpy as np
 from loopwright.pipeline.cases.own_model import LATE, GoneWrong
 from loopwright.pipeline.evaluation.closed_loop import UNREACHED_ERROR
 from loopwright.pipeline.evaluation.evidence import Evidence
-from loopwright.pipeline.evaluation.law_evidence import lock_up_text
+from loopwright.pipeline.evaluation.law_evidence import ColdStart, lock_up_text
 from loopwright.pipeline.evaluation.metric import NO_UNIT
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
-from loopwright.pipeline.evaluation.poor_laws import worst_cycle
+from loopwright.pipeline.evaluation.open_loop import COLD_STEPS
+from loopwright.pipeline.evaluation.poor_laws import COLD_NEAR, rest_words, worst_cycle
 from loopwright.pipeline.evaluation.proof import known_rows, statements
 from loopwright.pipeline.evaluation.validation import CheckedStatement
 from loopwright.pipeline.historian.settling import in_words
@@ -128,13 +129,14 @@ UNMEASURED = "not measured"
 
 
 def own_acceptance(evidence: Evidence) -> list[CheckedStatement]:
-    """The record proves the model; no law locks up; the best one settles, stays in range, bears noise, beats the PID.
+    """The record proves the model, no law locks up, and each begins at a rest of the record with its MV.
 
+    The best one settles, stays in range, bears noise and beats the PID.
     Every limit is a figure of the evidence, or the one by which a lock-up is told; its row says why.
     """
     on_models = evidence.case.stand_in == IDENTIFIED  # a simulator tells a wrong model itself
     proof = (*(statements(evidence.models) if on_models else ()), *known_rows(evidence.models))
-    rows = [*proof, *(_lock_ups(n, evidence) for n in evidence.laws)]
+    rows = [*proof, *(_lock_ups(n, evidence) for n in evidence.laws), *_cold_starts(evidence)]
     if evidence.best is None:
         return rows
     rows += [_settles(evidence, evidence.best), _in_range(evidence, evidence.best)]
@@ -177,6 +179,47 @@ def _lock_ups(name: str, evidence: Evidence) -> CheckedStatement:
     law = evidence.laws[name]
     where = lock_up_text(law.metrics.locked_up)
     return CheckedStatement(f"{name}, lock-ups over all tests", "0", str(law.lock_ups), law.lock_ups == 0, where)
+
+
+def _cold_starts(evidence: Evidence) -> Iterator[CheckedStatement]:
+    """A cold start at a rest of the record asks for its MV: a row for each law of ours."""
+    for name, law in evidence.laws.items():
+        found = law.metrics.cold_start
+        if found is None or name == evidence.old_loop:
+            continue
+        yield CheckedStatement(
+            f"{name}, cold start at a rest of the record asks for its MV: largest distance",
+            f"≤ {COLD_NEAR:g} % of the MV's range",
+            _cold_words(found),
+            not found.refused and (found.farthest or 0.0) <= COLD_NEAR if found.rests else None,
+            f"farthest at {rest_words(found)}" if found.at else "",
+        )
+
+
+def _cold_words(found: ColdStart) -> str:
+    if not found.rests:
+        return "the record has no rest"
+    refused = f"refused at {found.refused} of {found.rests} rests"
+    if found.first is None or found.later is None:
+        return refused
+    words = f"{found.first:.2g} % at the first of {COLD_STEPS} steps, {found.later:.2g} % later"
+    words += f"; {found.quarter:.2g} % at most at a quarter of the {found.rests} rests"
+    return f"{words}; {refused}" if found.refused else words
+
+
+def cold_starts(evidence: Evidence) -> list[str]:
+    """A sentence on each law of ours: what it asks for where it is started cold at rests of the record."""
+    known = {n: of for n, law in evidence.laws.items() if (of := law.metrics.cold_start) and n != evidence.old_loop}
+    if known and not any(of.rests for of in known.values()):
+        return [
+            "The record has no rest, at which MVs and measured disturbances stay until the process variables have "
+            "settled: no law could be started cold at one."
+        ]
+    return [
+        f"{name} was started cold at rests of the record, with the record's MVs applied. The largest distance of an MV "
+        f"that it asks for from the record's is, in shares of its range: {_cold_words(of)}."
+        for name, of in known.items()
+    ]
 
 
 def _settles(evidence: Evidence, law: str) -> CheckedStatement:

@@ -24,6 +24,7 @@ from loopwright.pipeline.report.law_tables import analyses, further_figures, law
 from loopwright.pipeline.report.own_acceptance import (
     against,
     beyond_reach,
+    cold_starts,
     dead_time_to_state,
     shipped_laws,
     step_test_to_run,
@@ -89,6 +90,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "offline": evidence.grounds is None,
         "replays": of_kind("replay_"),
         "replayed": [(name, mv, row) for name, law in evidence.laws.items() for mv, row in law.metrics.replay.items()],
+        "cold_starts": cold_starts(evidence),
         "overview": pictures.get("closed_loop.png"),
         "identified": model_section(evidence),
         "identified_heads": (VARIABLES, ANSWERS, TRIED),

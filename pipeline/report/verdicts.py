@@ -206,6 +206,7 @@ def _law(evidence: LawEvidence, on_models: bool) -> LawResult:
         evidence.analyses,
         own.swings,
         evidence.why_withheld if on_models else "",
+        own.cold_start,
     )
 
 

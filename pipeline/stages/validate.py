@@ -5,8 +5,9 @@ from __future__ import annotations
 import shutil
 import statistics
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -22,6 +23,7 @@ from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.extrapolation import grounds_of, widest
 from loopwright.pipeline.evaluation.law_evidence import (
     BASE,
+    ColdStart,
     Form,
     FormAnalysis,
     LawEvidence,
@@ -30,7 +32,7 @@ from loopwright.pipeline.evaluation.law_evidence import (
     lock_up_text,
 )
 from loopwright.pipeline.evaluation.model_evidence import identified_part
-from loopwright.pipeline.evaluation.open_loop import errors_at_rest, first_answers, replay
+from loopwright.pipeline.evaluation.open_loop import cold_start, errors_at_rest, first_answers, replay
 from loopwright.pipeline.evaluation.poor_laws import why_poor
 from loopwright.pipeline.evaluation.trials import Metrics, Trial, step_us, try_files
 from loopwright.pipeline.export.controller_file import with_evidence, withhold
@@ -91,14 +93,16 @@ def validate(name: str) -> None:
     trials = try_files(case, choices.noise_seed, work, label)
     old = trials.pop() if before.exists() else None
     at_rest = errors_at_rest(case) if case.on_models else {}
-    found = _judged(params, case, designed, trials, at_rest, old)
     files = {seed: controller_file(params.case, params.name, BASE, seed) for seed in seeds}
+    cold = _started_cold(params, case, files.values())
+    found = _judged(params, case, designed, trials, at_rest, old, cold)
     calm = {seed: calm_file(params.case, params.name, seed) for seed in seeds}
     if (why := found.metrics.why_withheld) and all(file.exists() for file in calm.values()):
         work = [(BASE, seed, file) for seed, file in calm.items()]
         again = try_files(case, choices.noise_seed, work, f"validate {name}: the same law with calmer numbers")
         again += [t for t in trials if t.form != BASE]
-        calmer = _judged(params, case, _calmed(designed), again, at_rest, old)
+        cold = _started_cold(params, case, calm.values())
+        calmer = _judged(params, case, _calmed(designed), again, at_rest, old, cold)
         if not calmer.metrics.why_withheld:
             why = found.metrics.poor.rpartition("; ")[0] or why  # the remedy has been found
             print(f"validate {name}: calmer numbers are shipped; with its own it {why}", file=sys.stderr)
@@ -139,6 +143,8 @@ def validate(name: str) -> None:
         evidence["beyond_reach"] = metrics.beyond_reach
     if metrics.calmed:
         evidence["calmed"] = metrics.calmed
+    if metrics.cold_start is not None:
+        evidence["cold_start"] = asdict(metrics.cold_start)
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
     target = ARTIFACTS / params.case / f"{params.name}.onnx"
@@ -172,11 +178,12 @@ def _judged(
     trials: list[Trial],
     at_rest: Mapping[str, float],
     old: Trial | None,
+    cold: ColdStart | None,
 ) -> JudgedTrials:
     """The figures of the trials; of a case on models also why the law is not shipped although it locked up nowhere."""
     # A candidate that locks up is out, whatever its mean; no scored test has a say.
     shipped = min((t for t in trials if t.form == BASE), key=lambda t: (t.development_lock_ups, t.development))
-    metrics = replace(_metrics(params, case, designed, trials, shipped), at_rest=at_rest)
+    metrics = replace(_metrics(params, case, designed, trials, shipped), at_rest=at_rest, cold_start=cold)
     if case.on_models and not metrics.why_withheld and params.name != case.old_loop:
         metrics = replace(metrics, poor=_why_poor(case, metrics, old))
     return JudgedTrials(trials, shipped, metrics)
@@ -220,6 +227,21 @@ def _replayed(case: Case, models: Mapping[str, Any], file: Path, path: Path) -> 
     found = replay(Controller(file), record, case.plant.signals, ahead, same_row=bool(structure.get("same_row")))
     np.savez_compressed(path, **cast(dict[str, Any], found.arrays()))
     return found.figures(case.plant.signals.mv)
+
+
+def _started_cold(params: ControllerParams, case: Case, files: Iterable[Path]) -> ColdStart | None:
+    """The MVs that files ask for at rests of the plant's record; None of a case that has no record.
+
+    Set points beyond a soft limit are no rests of a law: it leaves them.
+    """
+    if not case.on_models:
+        return None
+    signals, (least, most) = case.plant.signals, (params.settings.get(name) or () for name in ("cv_low", "cv_high"))
+    cut = (
+        replace(s, low=max(s.low, -np.inf if low is None else low), high=min(s.high, np.inf if high is None else high))
+        for s, low, high in zip_longest(signals.sp, least, most)
+    )
+    return cold_start([Controller(file) for file in files], case.recorded_rests, replace(signals, sp=tuple(cut)))
 
 
 def _keep_analysis(params: ControllerParams, seed: int, path: Path) -> None:
