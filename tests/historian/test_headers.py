@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from loopwright.pipeline.historian.files.file_reader import read_export
 from loopwright.pipeline.historian.files.headers import split_header
 
 
@@ -34,3 +37,12 @@ def test_a_unit_in_brackets_is_no_part_of_the_tag(header: str, tag: str, unit: s
 )
 def test_other_brackets_are_part_of_the_tag(header: str) -> None:
     assert split_header(header) == (header, "")
+
+
+def test_a_series_has_the_name_that_a_person_gave_its_column(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("time,TI-7 (C),FI-8 (m3/h)\n" + "".join(f"{k},{20 + k},{3 * k}\n" for k in range(5)))
+    found = read_export([path], ["TI-7 (C)", "FI-8"]).series
+    assert [*found] == ["TI-7 (C)", "FI-8"]
+    assert [s.tag for s in found.values()] == ["TI-7 (C)", "FI-8"]
+    assert found["TI-7 (C)"].value.tolist() == [20, 21, 22, 23, 24]

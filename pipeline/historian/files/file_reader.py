@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC as UTC_ZONE
 from datetime import datetime, tzinfo
 from pathlib import Path
@@ -35,7 +35,8 @@ def read_export(
 ) -> Export:
     """The series of ``tags`` and ``modes`` (texts allowed) of all files; of every column where none is named.
 
-    ``time_zone`` is that of dates that state none. Raises RecordError for a file that cannot be read, a tag that none
+    A tag may be named by its header, with the unit; its series has the name that was given. ``time_zone`` is that of
+    dates that state none. Raises RecordError for a file that cannot be read, a tag that none
     of them has, time that cannot be read.
     """
     if not paths:
@@ -43,6 +44,9 @@ def read_export(
     times = StatedTimes(time_column, time_format, time_zone, zone_named(time_zone) if time_zone else None)
     sources = [opened(path) for path in paths]
     columns = {column: tag for source in sources for column, tag in tags_of(source.header).items()}
+    given: dict[str, list[str]] = {}  # a series keeps the name that a person gave
+    for text in (*tags, *modes):
+        given.setdefault(tag_named(text, columns), []).append(text)
     tags, modes = [tag_named(t, columns) for t in tags], [tag_named(t, columns) for t in modes]
     read = [_of_file(source, times, {*tags, *modes}, set(modes)) for source in sources]
     together: dict[str, list[Series]] = {}
@@ -65,7 +69,7 @@ def read_export(
     if time_zone and not any(one.local for one in read):
         raise RecordError(f"--time-zone {time_zone}: no file has dates without a zone of their own; leave it out")
     return Export(
-        {name: joined(p) for name, p in together.items()},
+        {own: replace(joined(p), tag=own) for name, p in together.items() for own in given.get(name, (name,))},
         tuple((str(path), sha256(path)) for path in paths),
         " and ".join(dict.fromkeys(one.kind for one in read)),
         rows,
