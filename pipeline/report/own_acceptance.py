@@ -182,23 +182,21 @@ def _lock_ups(name: str, evidence: Evidence) -> CheckedStatement:
 
 
 def _cold_starts(evidence: Evidence) -> Iterator[CheckedStatement]:
-    """A cold start at a rest of the record asks for its MV: a row for each law of ours."""
+    """A cold start at a rest of the record asks for its MV: a row for each law of ours, none without such a rest."""
     for name, law in evidence.laws.items():
         found = law.metrics.cold_start
-        if found is None or name == evidence.old_loop:
+        if found is None or not found.rests or name == evidence.old_loop:
             continue
         yield CheckedStatement(
             f"{name}, cold start at a rest of the record asks for its MV: largest distance",
             f"≤ {COLD_NEAR:g} % of the MV's range",
             _cold_words(found),
-            not found.refused and (found.farthest or 0.0) <= COLD_NEAR if found.rests else None,
+            not found.refused and (found.farthest or 0.0) <= COLD_NEAR,
             f"farthest at {rest_words(found)}" if found.at else "",
         )
 
 
 def _cold_words(found: ColdStart) -> str:
-    if not found.rests:
-        return "the record has no rest"
     refused = f"refused at {found.refused} of {found.rests} rests"
     if found.first is None or found.later is None:
         return refused
@@ -209,7 +207,8 @@ def _cold_words(found: ColdStart) -> str:
 
 def cold_starts(evidence: Evidence) -> list[str]:
     """A sentence on each law of ours: what it asks for where it is started cold at rests of the record."""
-    known = {n: of for n, law in evidence.laws.items() if (of := law.metrics.cold_start) and n != evidence.old_loop}
+    starts = {n: law.metrics.cold_start for n, law in evidence.laws.items() if n != evidence.old_loop}
+    known = {name: of for name, of in starts.items() if of is not None}
     if known and not any(of.rests for of in known.values()):
         return [
             "The record has no rest, at which MVs and measured disturbances stay until the process variables have "
@@ -219,6 +218,7 @@ def cold_starts(evidence: Evidence) -> list[str]:
         f"{name} was started cold at rests of the record, with the record's MVs applied. The largest distance of an MV "
         f"that it asks for from the record's is, in shares of its range: {_cold_words(of)}."
         for name, of in known.items()
+        if of.rests
     ]
 
 
