@@ -150,18 +150,22 @@ def _objection(one: Known, answers: Sequence[tuple[float, float]], nothing: floa
 
 # ----------------------------------------------------------------------------- the dead times that a record leaves open
 LONGEST_STATED = 150  # periods: a later answer would need more lags than records have rows for
-BESIDE_AN_END = 2  # lags on either side of a stated end with a coefficient of their own
+BESIDE_AN_END = 3  # lags on either side of a stated end, or of the likeliest dead time, with a coefficient of their own
+LOOKS = 3  # fits, each with lags of their own near the likeliest dead time of the one before
 LAGS_BEYOND = 30  # lags behind the stated most: an answer that begins there must not be taken for an earlier one
 FEWEST_ANSWER_LAGS = 90  # lags: those of the answers that sign and gain are compared with
 MOST_COMPARED_ROWS = 60_000  # rows: more tell nothing more, and take memory
 LAGS_TRIED = (0.0, *np.geomspace(1.0, 200.0, 11).tolist(), 1e4)  # rows: from none to one that integrates
 SWINGS_TRIED = tuple(np.geomspace(2.0, 60.0, 8).tolist())  # rows: 1 over the angular frequency of plants that swing
-DAMPINGS_TRIED = (0.2, 0.5)  # of those; above them three lags come as near
-CLEAR_ANSWER = 30.0  # chi-squared of an answer at all, of which many shapes are tried
+DAMPINGS_TRIED = (0.2, 0.5)  # damping ratios of plants that swing, no unit; above them three lags come as near
+CLEAR_CHI_SQUARED = (
+    30.0  # chi-squared by which an answer is better than none: many shapes are tried, and chance gives the best some
+)
 CERTAIN_LOSS = 14.0  # chi-squared by which a dead time is worse, of which some ten are told apart: 3.7 deviations
 ZEROS_LOSS = 6.0  # chi-squared by which a plant without zeros is worse: the two coefficients that it lacks explain 2
-MORE_LAGS, RISEN = 0.3, 0.632  # share of the time to 63 %: by so much five lags look later than three
-SHAPE_RIDGE = 1e-9  # of the squares of shapes that are scaled to 1: two lags as good as equal stay solvable
+MORE_LAGS = 0.25  # share of the rise: so much later do five equal lags look than three
+RISEN = 0.632  # share of an answer's last value: a lag has risen to it after its time constant
+SHAPE_RIDGE = 1e-9  # share of the squares of shapes: lags that are as good as equal stay solvable
 
 
 def dead_times_left(y: Array, u: Array, run: NDArray[np.int64], j: int, said: tuple[int, int]) -> DeadTimeBounds | None:
@@ -173,26 +177,30 @@ def dead_times_left(y: Array, u: Array, run: NDArray[np.int64], j: int, said: tu
         y(k+1) = sum_l a_l y(k-l) + sum_l b_l u(k-l) + e(k+1)   have   b_l = g_l - sum_{i<l} a_i g_(l-1-i),
 
     g the answer to an impulse. The g of a dead time and three poles with any zeros are compared with a and b by
-    chi-squared, over the misfit of the best: a dead time is left where it is not ``CERTAIN_LOSS`` worse. Slow first
-    rows of three lags are so told from a dead time as far as the record can tell them.
+    chi-squared, over the misfit of the best: a dead time is left where it is not ``CERTAIN_LOSS`` worse. Zeros can
+    stand in for a dead time; where a plant without any is as good, it says which ones are too early. More lags than
+    three begin so slowly that they look like a later dead time: the least is earlier by ``MORE_LAGS`` of the rise.
     """
     if said[1] > LONGEST_STATED or len(y) < 2:
         return None
     y, u, run = y[:MOST_COMPARED_ROWS], u[:MOST_COMPARED_ROWS], run[:MOST_COMPARED_ROWS]
     longest = max(FEWEST_ANSWER_LAGS, 2 * said[1] + LAGS_BEYOND)
-    plain, own = blocks_to(longest), _blocks_near(longest, said)
-    model = DirectModel.of_blocks(y, u, run, [own if of == 1 + j else plain for of in range(1 + u.shape[1])])
-    if model is None:
-        return None
-    found = _losses(model, j, 2 * longest // 3)
-    if found is None:
-        return DeadTimeBounds()
-    loss, without_zeros, rise = found
+    blocks, ends = [blocks_to(longest)] * (1 + u.shape[1]), tuple[int, ...](said)
+    for _ in range(LOOKS):  # lags that share a coefficient blur the dead time; near the likeliest none does
+        blocks[1 + j] = _blocks_near(longest, ends)
+        model = DirectModel.of_blocks(y, u, run, blocks)
+        if model is None:
+            return None
+        found = _losses(model, j, 2 * longest // 3)
+        if found is None:
+            return DeadTimeBounds()
+        loss, without_zeros, rise = found
+        ends = (*said, int(loss.argmin()))
     left = np.flatnonzero(loss <= loss.min() + CERTAIN_LOSS)
     least = int(left[0])
     if without_zeros.min() <= loss.min() + ZEROS_LOSS:
-        early = int((without_zeros <= without_zeros.min() + CERTAIN_LOSS).argmax())
-        least = max(least, int(early - MORE_LAGS * rise))
+        least = max(least, int((without_zeros <= without_zeros.min() + CERTAIN_LOSS).argmax()))
+    least = max(int(least - MORE_LAGS * rise), 0)
     most = None if left[-1] == len(loss) - 1 else int(left[-1])
     return DeadTimeBounds(least if most is None else min(least, most), most)
 
@@ -205,14 +213,14 @@ def _losses(model: DirectModel, j: int, latest: int) -> tuple[Array, Array, int]
     m, n = len(model.blocks[0]), len(model.blocks[1 + j])
     first, longest = sum(map(len, model.blocks[: 1 + j])), model.blocks[1 + j][-1][1]
     sums, widths = np.zeros((n, longest)), [b - a for a, b in model.blocks[0]]
-    for of, (a, b) in zip(sums, model.blocks[1 + j], strict=True):
-        of[a:b] = 1.0
+    for row, (begin, end) in zip(sums, model.blocks[1 + j], strict=True):
+        row[begin:end] = 1.0
     by_own = np.repeat(np.eye(m) / widths, widths, axis=1)  # a of each coefficient of y's blocks
     b_of_g = sums @ (np.eye(longest) - _past(model.theta[:m] @ by_own))
     b = model.theta[first : first + n]
     shapes, three = _poles(longest)
     plain = _cascades(shapes, three)
-    g: Array = np.linalg.lstsq(b_of_g, b, rcond=COVARIANCE_RIDGE)[0]
+    g: Array = np.asarray(np.linalg.lstsq(b_of_g, b, rcond=COVARIANCE_RIDGE)[0], dtype=np.float64)
     for last in (False, True):  # how open a leaves b depends on g
         jacobian = np.zeros((n, len(model.theta)))
         jacobian[:, first : first + n] = np.eye(n)
@@ -228,9 +236,9 @@ def _losses(model: DirectModel, j: int, latest: int) -> tuple[Array, Array, int]
         if not last:
             one, dead = np.unravel_index(int(chi.argmin()), chi.shape)
             of = np.column_stack([np.zeros((3, dead)), shapes[three[one], : longest - dead]])
-            g = np.linalg.lstsq(white @ of.T, target, rcond=SHAPE_RIDGE)[0] @ of
+            g = np.asarray(np.linalg.lstsq(white @ of.T, target, rcond=SHAPE_RIDGE)[0] @ of, dtype=np.float64)
     least, nothing = float(chi.min()), float(target @ target)
-    if nothing - least < CLEAR_ANSWER:
+    if nothing - least < CLEAR_CHI_SQUARED:
         return None
     alone = np.column_stack([nothing - (_late(plain, white, dead) @ target) ** 2 for dead in range(latest)])
     step = np.cumsum(plain[alone.min(axis=1).argmin()])
@@ -286,9 +294,9 @@ def _past(a: Array) -> Array:
     return np.asarray(toeplitz(np.r_[0.0, a[:-1]], np.zeros(len(a))))
 
 
-def _blocks_near(longest: int, said: tuple[int, int]) -> Blocks:
-    """Blocks of lags up to ``longest``: of one lag each first and near what is said, wider ones between."""
+def _blocks_near(longest: int, ends: tuple[int, ...]) -> Blocks:
+    """Blocks of lags up to ``longest``: of one lag each first and near some ``ends``, wider ones between."""
     edges = {edge for block in blocks_to(longest) for edge in block}
-    for end in said:
+    for end in ends:
         edges |= set(range(max(end - BESIDE_AN_END, 0), end + BESIDE_AN_END + 1))
     return tuple(pairwise(sorted(edge for edge in edges if edge <= longest)))

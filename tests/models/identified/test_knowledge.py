@@ -122,22 +122,22 @@ def test_a_dead_time_limits_the_delays_on_offer() -> None:
     assert {tuple(c["delays"]) for c in exact["candidates_tried"]} == {(4,)}
     assert exact["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.02)
     (of,) = exact["proof"]["known"]
-    assert (of["says"], of["verdict"], of["model_s"], of["way"]) == ("dead 8..8", "agrees", 8.0, 0)
+    assert (of["says"], of["verdict"], of["model_s"], of["way"]) == ("dead 8..8", "open", 8.0, 0)
     assert of["record_s"][0] <= 8.0 <= of["record_s"][1]
 
 
-@pytest.mark.parametrize(("said", "least_s", "most_s"), [("dead 0..4", 8, None), ("dead 20..24", None, 12)])
+@pytest.mark.parametrize(("said", "least_s", "most_s"), [("dead 0..6", 10, None), ("dead 40..50", None, 26)])
 def test_a_dead_time_that_the_record_contradicts_is_a_question_and_limits_no_delay(
     said: str, least_s: float | None, most_s: float | None
 ) -> None:
-    """The dead time is 8 s, 4 periods."""
-    record, signals = made_plants.second_order(800, delay=4), made_plants.signals_of(1, 1)
+    """The dead time is 20 s, 10 periods."""
+    record, signals = made_plants.second_order(800, delay=10), made_plants.signals_of(1, 1)
     asked = learnt(record, signals, ("y0", "u0", f"+, {said}"))
     sign, dead = figures(asked)["proof"]["known"]
     assert (sign["says"], sign["verdict"]) == ("+", "agrees")
     assert (dead["says"], dead["verdict"]) == (said, "contradicted")
-    assert dead["model_s"] == pytest.approx(8.0)
-    assert least_s is None or dead["record_s"][0] >= least_s - 2
+    assert dead["model_s"] == pytest.approx(20.0, abs=4.0)
+    assert least_s is None or dead["record_s"][0] >= least_s
     assert most_s is None or dead["record_s"][1] <= most_s
     assert dead["question"] in sign_doubts(asked)
     of_sign, of_dead = known_rows(asked)
