@@ -69,6 +69,7 @@ def test_a_contradiction_is_asked(words: str, capsys: pytest.CaptureFixture[str]
     out = capsys.readouterr().out
     assert known()[0].question(0.0, 0.0).partition("' is said")[0] in out
     assert "loopwright run tank" not in out  # the question comes first
+    assert f"you know of {known()[0].pair}" in Path("data/tank/screening.html").read_text()
 
 
 def test_the_table_shows_the_pairs_and_takes_what_is_known_of_them() -> None:
