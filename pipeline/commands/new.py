@@ -45,16 +45,16 @@ from loopwright.pipeline.config.params import add_entries, sections
 from loopwright.pipeline.config.plants import check_name
 from loopwright.pipeline.errors import PipelineError, RecordError
 from loopwright.pipeline.files import draft_folder_of, write_json, write_text
-from loopwright.pipeline.historian.answers import Beside, beside_record
 from loopwright.pipeline.historian.cleaning.record_rows import evenly
 from loopwright.pipeline.historian.cleaning.tags import RANGES, ROLES, TableError, Tag, limited, named
 from loopwright.pipeline.historian.export_params import read_and_screen, with_units
 from loopwright.pipeline.historian.guessing import controlled_first
 from loopwright.pipeline.historian.screening import Refusal, Screened, refusal
+from loopwright.pipeline.historian.stated_answers import Beside, beside_record
 from loopwright.pipeline.historian.step_test import planned
 from loopwright.pipeline.plants.simulator_file import FileSimulator, is_fmu
 from loopwright.pipeline.records.record import Record
-from loopwright.pipeline.report.screening import tell, write_page
+from loopwright.pipeline.report.screening import known_lines, tell, write_page
 from loopwright.pipeline.stages.paths import DATA, WORK
 from loopwright.serving.words import plain
 
@@ -195,7 +195,8 @@ def _write(
     signals = signals_as_tags(found.record, tags)
     said = stated_of(signals, options.known)
     known, more = known_kept(name, said, signals) if options.replace else (said.known, [])
-    questions = [beside.question for beside in _beside(known, found.record) if beside.question]
+    beside = _beside(known, found.record)
+    questions = [words for one in beside for words in one.questions]
     unusable, lost = refusal(found, tags, options.anyway), list[str]()
     if unusable and folder.exists() and (name in sections("plants") or not _refused(folder)):
         folder = folder.with_name(f"{name}-refused")  # the plant that was to be replaced stays
@@ -217,7 +218,7 @@ def _write(
             keep(made, draft)
         if test:
             write_text(draft / "step_test.csv", test.table())
-        write_page(draft / "screening.html", found, test)
+        write_page(draft / "screening.html", found, test, beside)
         if folder.exists():
             folder.rename(earlier)
     if not unusable:
@@ -246,7 +247,7 @@ def _write(
             print(plain(f"{line}; is it so? Column loop of the table of tags corrects it"))
     for line in confirmed(found.record.mv_signals, tags, {old.mv for old in report.old_controllers}):
         print(line)
-    for line in (*(f"you know of {one.pair}: {one.says}" for one in known), *questions):
+    for line in known_lines(beside):
         print(line)
     if questions:
         print("no controller is shipped before that is answered: change the statement, or the tags")

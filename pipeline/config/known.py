@@ -19,6 +19,9 @@ CONTRADICTION_SDS = 3.0
 NO_ANSWER = 0.1
 """Change of a PV by a move of an input, both over their standard deviations in the record: a smaller answer is none."""
 
+DEAD_TIME_ROUNDING = 1e-6
+"""Share of a period: a dead time of whole periods in seconds is that many periods."""
+
 
 @dataclass(frozen=True, slots=True)
 class Known:
@@ -64,8 +67,17 @@ class Known:
     @property
     def says(self) -> str:
         """The statement, as ``--known`` takes it."""
-        spans = (("gain", self.gain), ("dead", self.dead_s))
-        return ", ".join(filter(None, (self.sign, *(f"{what} {_span(ends)}" for what, ends in spans if ends))))
+        return ", ".join(filter(None, (self.says_gain, self.says_dead)))
+
+    @property
+    def says_gain(self) -> str:
+        """The part of the statement on sign and gain; empty where it has none."""
+        return ", ".join(filter(None, (self.sign, f"gain {_span(self.gain)}" if self.gain else "")))
+
+    @property
+    def says_dead(self) -> str:
+        """The part of the statement on the dead time; empty where it has none."""
+        return f"dead {_span(self.dead_s)}" if self.dead_s else ""
 
     @property
     def gains(self) -> tuple[float, float]:
@@ -96,9 +108,24 @@ class Known:
             "round, or the statement?"
         )
 
+    def dead_question(self, least_s: float, most_s: float | None) -> str:
+        """The question where a record is certain of another dead time: not below ``least_s``, not above ``most_s``."""
+        return (
+            f"{self.pair}: {self.says_dead!r} is said, and the record is certain of "
+            f"{span_words(least_s, most_s)}: is the statement right, in seconds, and are the tags the right ones?"
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """For params.yaml: what is not known is left out."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items() if v not in ("", None)}
+
+
+def periods_of(known: Known, period_s: float) -> tuple[int, int]:
+    """Least and most whole periods of a stated dead time; ValueError where none is stated."""
+    if known.dead_s is None:
+        raise ValueError(f"{known.pair}: no dead time is stated")
+    first, last = (math.floor(s / period_s + DEAD_TIME_ROUNDING) for s in known.dead_s)
+    return first, last
 
 
 def stated(pv: str, given: str, text: str) -> Known:
@@ -141,6 +168,11 @@ def _number(text: str, where: str) -> float:
         return float(text.replace(",", ".").replace("\N{MINUS SIGN}", "-"))
     except ValueError:
         raise ValueError(f"{where!r}: {text!r} is no number; write {FORMS}") from None
+
+
+def span_words(least_s: float, most_s: float | None) -> str:
+    """Least and most dead time [s] in words; None: there is no most."""
+    return f"{least_s:g} s or more" if most_s is None else f"{least_s:g} to {most_s:g} s"
 
 
 def _span(ends: tuple[float, float]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from loopwright.pipeline.config.known import span_words
 from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
 from loopwright.pipeline.evaluation.validation import CheckedStatement
 
@@ -268,23 +269,43 @@ WHY = {
 
 
 def known_rows(models: Mapping[str, Metrics]) -> list[CheckedStatement]:
-    """A row for each statement of an engineer. ``models``: model set -> its metrics.json."""
+    """A row for each statement of an engineer, on sign and gain or on the dead time.
+
+    ``models``: model set -> its metrics.json.
+    """
     rows = []
     for of in _statements(identified_part(models).get("proof") or {}):
-        used = "gain" in of
-        measured = f"model, at the middle, {of['gain']:.3g} ± {of['spread']:.2g}" if used else "not compared"
-        if used and of["direct"] is not None:
-            measured += f"; one-step predictions, on the way, {of['direct']:.3g} ± {of['sd']:.2g}"
+        used, dead = of["verdict"] != "unused", "dead_s" in of
         rows.append(
             CheckedStatement(
-                f"what is known of the answer of {of['pv']} to {of['input']}",
+                f"what is known of the {'dead time' if dead else 'answer'} of {of['pv']} to {of['input']}",
                 of["says"],
-                measured,
+                (_dead_words(of) if dead else _gain_words(of)) if used else "not compared",
                 of["verdict"] in {"agrees", "open"} if used else None,
                 of.get("question") or WHY[of["verdict"]],
             )
         )
     return rows
+
+
+def _gain_words(of: Mapping[str, Any]) -> str:
+    """The gains of model and record beside a statement, in words."""
+    words = f"model, at the middle, {of['gain']:.3g} ± {of['spread']:.2g}"
+    return (
+        words
+        if of["direct"] is None
+        else f"{words}; one-step predictions, on the way, {of['direct']:.3g} ± {of['sd']:.2g}"
+    )
+
+
+def _dead_words(of: Mapping[str, Any]) -> str:
+    """The dead times of model and record beside a statement, in words."""
+    words = f"model {of['model_s']:g} s"
+    if of["likely_s"] is not None:
+        words += f", {span_words(*of['likely_s'])} as likely"
+    if of["record_s"] is None:
+        return f"{words}; too few rows to compare the record by itself"
+    return f"{words}; the record by itself leaves {span_words(*of['record_s'])}"
 
 
 def question(models: Mapping[str, Metrics]) -> str:

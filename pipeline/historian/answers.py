@@ -18,10 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_toeplitz, solve_triangular, toeplitz
 
-from loopwright.pipeline.config.known import CONTRADICTION_SDS, NO_ANSWER, NONE, Known
 from loopwright.pipeline.historian.arx_model import Blocks, blocks_of
 from loopwright.pipeline.metrics import Array
-from loopwright.pipeline.records.record import Record
 
 FINE_LAGS = 6  # lags with a coefficient of their own; later ones share one
 LAG_BLOCK_GROWTH = 1.5  # a block over the one before
@@ -44,8 +42,7 @@ class DirectModel:
 
     theta: Array
     covariance: Array
-    blocks: Blocks
-    inputs: int
+    blocks: tuple[Blocks, ...]  # of y, then of each input
     sd: float  # of e
     rows: int
 
@@ -53,16 +50,21 @@ class DirectModel:
     def of(cls, y: Array, u: Array, run: NDArray[np.int64], longest: int = 40) -> DirectModel | None:
         """Fit to a PV y (n,) and its inputs u (n, m), with lags up to ``longest`` rows; None where rows are too few."""
         longest = min(max(longest, FEWEST_LAGS), MOST_LAGS)
-        while True:
-            blocks = blocks_to(longest)
-            k = np.arange(longest, len(y) - 1)
-            k = k[run[k - longest] == run[k + 1]]
-            if len(k) >= ROWS_A_COEFFICIENT * (len(blocks) * (1 + u.shape[1]) + 1):
-                break
+        while (model := cls.of_blocks(y, u, run, [blocks_to(longest)] * (1 + u.shape[1]))) is None:
             if longest <= FEWEST_LAGS:
                 return None
             longest = max(longest // 2, FEWEST_LAGS)
-        columns = [blocks_of(c - c.mean(), k, blocks) for c in (y, *u.T)]
+        return model
+
+    @classmethod
+    def of_blocks(cls, y: Array, u: Array, run: NDArray[np.int64], blocks: Sequence[Blocks]) -> DirectModel | None:
+        """Fit with the ``blocks`` of y, then of each input; None where rows are too few."""
+        longest = max(of[-1][1] for of in blocks)
+        k = np.arange(longest, len(y) - 1)
+        k = k[run[k - longest] == run[k + 1]]
+        if len(k) < ROWS_A_COEFFICIENT * (sum(map(len, blocks)) + 1):
+            return None
+        columns = [blocks_of(c - c.mean(), k, of) for c, of in zip((y, *u.T), blocks, strict=True)]
         x = np.column_stack([*columns, np.ones(len(k))])
         target = y[k + 1] - y.mean()
         scale = np.where(x.std(axis=0) > 0, x.std(axis=0), 1.0)
@@ -78,19 +80,15 @@ class DirectModel:
         scores = np.array([z[i:j].T @ e[i:j] for i, j in pairwise(edges)]) / n
         white = float(e.var()) / n
         covariance = white * (inverse + lost @ lost.T / least) + inverse @ (scores.T @ scores) @ inverse
-        return cls(theta / scale, covariance / np.outer(scale, scale), blocks, u.shape[1], float(e.std()), n)
+        return cls(theta / scale, covariance / np.outer(scale, scale), tuple(blocks), float(e.std()), n)
 
     def answer(self, j: int, first: int, last: int) -> tuple[float, float]:
         """(mean answer over rows ``first`` to ``last`` after a unit step of input j, its standard deviation).
 
-        From the middle two thirds of ``COEFFICIENT_DRAWS`` sets of coefficients that are as likely as these.
+        From the middle two thirds of ``step_answers``.
         """
-        rng = np.random.default_rng(0)
-        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
-        spread = vectors * np.sqrt(np.maximum(values, 0.0))
-        thetas = self.theta + rng.standard_normal((COEFFICIENT_DRAWS, len(values))) @ spread.T
         with np.errstate(over="ignore", invalid="ignore"):
-            found = self._steps(np.vstack([self.theta, thetas]), j, last)[:, first - 1 :].mean(axis=1)
+            found = self.step_answers(j, last)[:, first - 1 :].mean(axis=1)
         found = np.nan_to_num(found, posinf=1e300, neginf=-1e300)
         low, high = np.quantile(found[1:], [0.16, 0.84])
         return float(found[0]), float(max(high / 2 - low / 2, 1e-300))
@@ -100,17 +98,31 @@ class DirectModel:
         value, sd = self.answer(j, first, last)
         return (value, sd) if abs(value) <= most else None
 
-    def _steps(self, thetas: Array, j: int, rows: int) -> Array:
-        """Answers (d, rows) to a unit step of input j under coefficients (d, p)."""
-        m, longest = len(self.blocks), self.blocks[-1][1]
-        widths = np.repeat([b - a for a, b in self.blocks], [b - a for a, b in self.blocks])
-        of = np.repeat(np.arange(m), [b - a for a, b in self.blocks])
-        own, pushes = thetas[:, of] / widths, np.cumsum(thetas[:, m * (1 + j) + of] / widths, axis=1)
+    def step_answers(self, j: int, rows: int) -> Array:
+        """Answers (1 + ``COEFFICIENT_DRAWS``, rows) to a unit step of input j.
+
+        The first is that of ``theta``, the others those of sets of coefficients that are as likely.
+        """
+        rng = np.random.default_rng(0)
+        values, vectors = np.linalg.eigh((self.covariance + self.covariance.T) / 2)
+        spread = vectors * np.sqrt(np.maximum(values, 0.0))
+        drawn = self.theta + rng.standard_normal((COEFFICIENT_DRAWS, len(values))) @ spread.T
+        thetas, first = np.vstack([self.theta, drawn]), sum(map(len, self.blocks[: 1 + j]))
+        own = _by_lag(thetas, self.blocks[0])
+        pushes = np.cumsum(_by_lag(thetas[:, first:], self.blocks[1 + j]), axis=1)
+        longest = own.shape[1]
         y = np.zeros((len(thetas), longest + rows))
-        for k in range(rows):
-            past = y[:, k : k + longest][:, ::-1]
-            y[:, longest + k] = np.einsum("ij,ij->i", own, past) + pushes[:, min(k, longest - 1)]
+        with np.errstate(over="ignore", invalid="ignore"):
+            for k in range(rows):
+                past = y[:, k : k + longest][:, ::-1]
+                y[:, longest + k] = np.einsum("ij,ij->i", own, past) + pushes[:, min(k, pushes.shape[1] - 1)]
         return y[:, longest:]
+
+
+def _by_lag(thetas: Array, blocks: Blocks) -> Array:
+    """Weights (d, lags) of each lag, of the coefficients (d, blocks ..) of blocks."""
+    widths = [b - a for a, b in blocks]
+    return np.repeat(thetas[:, : len(blocks)] / widths, widths, axis=1)
 
 
 def blocks_to(longest: int) -> Blocks:
@@ -227,78 +239,3 @@ def whitening(e: Array) -> Array:
     own = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: COLOUR + 1]
     own[0] = own[0] * (1.0 + 1e-9) + 1e-300  # nothing at all is white too
     return np.r_[1.0, -solve_toeplitz(own[:COLOUR], own[1:])]
-
-
-# ---------------------------------------------------------------------------- a record beside an engineer's statements
-STATEMENT_WINDOWS = ((20, 30), (40, 60), (60, 90))
-"""Rows after a step over which an answer is taken; the last ones come nearest to the gain."""
-
-STATEMENT_SETTLED = 0.1
-"""Share of an answer by which it may still change from the last window but one to the last where it has settled."""
-
-ANY_ANSWER = 1e3
-"""Change of a PV by a move of an input, both over their deviations: beyond it a model explodes and says nothing."""
-
-
-@dataclass(frozen=True, slots=True)
-class Beside:
-    """A statement beside the record: the ``answer`` (value, standard deviation) [PV/input] that is most certain.
-
-    None where the rows are too few, or where their model explodes. ``objection`` is the answer that contradicts the
-    statement for certain; None where none does.
-    """
-
-    known: Known
-    answer: tuple[float, float] | None = None
-    objection: tuple[float, float] | None = None
-
-    @property
-    def question(self) -> str:
-        """The question to ask; empty where nothing speaks against the statement."""
-        return "" if self.objection is None else self.known.question(*self.objection)
-
-    @property
-    def agrees(self) -> bool:
-        """Whether the record by itself is certain of the sign that is said."""
-        return self.answer is not None and self.known.way * self.answer[0] >= CONTRADICTION_SDS * self.answer[1]
-
-
-def beside_record(known: Sequence[Known], record: Record) -> list[Beside]:
-    """Each statement beside the record.
-
-    A sign is contradicted by an answer that is certain to have the other one and keeps it in the last window; ``none``
-    by one that is certain to be more than ``NO_ANSWER``. A stated gain can only be too large for an answer that has not
-    settled.
-    """
-    pvs, inputs = [s.name for s in record.pv_signals], [s.name for s in (*record.mv_signals, *record.dv_signals)]
-    moves, found = np.hstack([record.mv, record.dv]), list[Beside]()
-    for one in known:
-        i, j = pvs.index(one.pv), inputs.index(one.input)
-        model = DirectModel.of(record.pv[:, i], moves, record.run, STATEMENT_WINDOWS[-1][1])
-        unit = float(record.pv[:, i].std() / max(moves[:, j].std(), 1e-300))
-        answers = (
-            [] if model is None else [model.answer_within(j, *rows, ANY_ANSWER * unit) for rows in STATEMENT_WINDOWS]
-        )
-        known_answers = [a for a in answers if a is not None]
-        if not known_answers or answers[-1] is None:
-            found.append(Beside(one))
-            continue
-        surest = max(known_answers, key=lambda a: abs(a[0]) / a[1])
-        found.append(Beside(one, surest, _objection(one, known_answers, NO_ANSWER * unit)))
-    return found
-
-
-def _objection(one: Known, answers: Sequence[tuple[float, float]], nothing: float) -> tuple[float, float] | None:
-    """The answer that contradicts the statement; ``answers`` of the windows, the last one last."""
-    last = answers[-1]
-    if one.sign == NONE:
-        return next((a for a in answers if one.excludes(*a, nothing)), None)
-    other = [a for a in answers if one.way * a[0] < -CONTRADICTION_SDS * a[1]]
-    if other and one.way * last[0] < 0:
-        return max(other, key=lambda a: abs(a[0]) / a[1])
-    if one.gain is None or not one.excludes(*last):
-        return None
-    settled = len(answers) > 1 and abs(last[0] - answers[-2][0]) <= max(STATEMENT_SETTLED * abs(last[0]), last[1])
-    low, high = one.gains
-    beyond = last[0] > max(high, 0.0) or last[0] < min(low, 0.0)  # further from 0 than any gain that is said
-    return last if settled or beyond else None

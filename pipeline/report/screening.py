@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.figure import Figure as Canvas
 
-from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.config.known import Known, span_words
 from loopwright.pipeline.files import write_text
 from loopwright.pipeline.historian.cleaning.findings import InputReport, RecordJudgement, Screening, counted
 from loopwright.pipeline.historian.files.quality import Reason
 from loopwright.pipeline.historian.files.signal_statistics import HELD_ROWS
 from loopwright.pipeline.historian.screening import Screened
 from loopwright.pipeline.historian.settling import in_words
+from loopwright.pipeline.historian.stated_answers import Beside
 from loopwright.pipeline.historian.step_test import StepTest
 from loopwright.pipeline.pictures.drawing import axis_label, png, ratio_unit
 from loopwright.pipeline.pictures.excitation_pictures import inputs, verdict
@@ -29,8 +30,8 @@ VERDICTS = {
 }
 
 
-def write_page(path: Path, found: Screened, test: StepTest | None) -> None:
-    """Write the page of a screening, whole or not at all."""
+def write_page(path: Path, found: Screened, test: StepTest | None, known: Sequence[Beside] = ()) -> None:
+    """Write the page of a screening, whole or not at all; ``known`` are an engineer's statements beside the record."""
     report = found.report
     pictures = {
         "trends": trends(found),
@@ -47,6 +48,7 @@ def write_page(path: Path, found: Screened, test: StepTest | None) -> None:
         "kept_percent": 100.0 * report.kept_rows / report.grid_rows,
         "when": times_of(found).words,
         "test": test,
+        "known": known_lines(known),
     }
     write_text(path, render("screening.html.j2", content))
 
@@ -103,6 +105,17 @@ def _after(first_s: float, possible_s: float) -> str:
     if possible_s <= 0 < first_s:
         return f"first answer after {first_s:g} s at most"
     return f"first answer after {f'{possible_s:g} to ' if possible_s < first_s else ''}{first_s:g} s"
+
+
+def known_lines(known: Sequence[Beside]) -> list[str]:
+    """A line for each statement of an engineer, with the dead times that the record leaves; then the questions."""
+    lines = []
+    for one in known:
+        words = f"you know of {one.known.pair}: {one.known.says}"
+        if one.dead is not None:
+            words += f"; the record by itself leaves {span_words(*one.dead_s)} of dead time"
+        lines.append(words)
+    return [*lines, *(question for one in known for question in one.questions)]
 
 
 # -------------------------------------------------------------------------------- lines that are printed of a screening

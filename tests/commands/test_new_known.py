@@ -62,13 +62,14 @@ def test_nothing_said_writes_nothing() -> None:
     assert "known" not in yaml.safe_load(Path("params.yaml").read_text())["plants"]["tank"]
 
 
-@pytest.mark.parametrize("words", ["-", "gain 2..3", "gain -3..0.1"])
+@pytest.mark.parametrize("words", ["-", "gain 2..3", "gain -3..0.1", "dead 600..700"])
 def test_a_contradiction_is_asked(words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    """The gain is .8."""
+    """The gain is .8, and the dead time is less than a minute."""
     assert main([*NEW, *said(f"{MV}={words}")]) == 0
     out = capsys.readouterr().out
     assert known()[0].question(0.0, 0.0).partition("' is said")[0] in out
     assert "loopwright run tank" not in out  # the question comes first
+    assert f"you know of {known()[0].pair}" in Path("data/tank/screening.html").read_text()
 
 
 def test_the_table_shows_the_pairs_and_takes_what_is_known_of_them() -> None:

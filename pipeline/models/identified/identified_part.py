@@ -15,7 +15,7 @@ from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
 from loopwright.pipeline.models.identified.gain_trend import GainTrend, gain_trends
 from loopwright.pipeline.models.identified.identified import Identified, assemble_model, noise_of
 from loopwright.pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
-from loopwright.pipeline.models.identified.knowledge import known_figures
+from loopwright.pipeline.models.identified.knowledge import ModelDelay, known_figures
 from loopwright.pipeline.models.identified.model_validation import (
     ProvenAnswer,
     foreseen,
@@ -183,7 +183,8 @@ class IdentifiedPart(Part):
             for mv, trend in zip(source.signals.mv, row, strict=True):
                 of = gain_table[pv.name][mv.name]
                 of["trend"] = trend._asdict() | {"certain": trend.certain, "at_end": trend.at_end * of["gain"]}
-        said = {"known": known_figures(searched.known, gain_table, record)} if searched.known else {}
+        delays = _delays(selection, inputs)
+        said = {"known": known_figures(searched.known, gain_table, record, delays)} if searched.known else {}
         metrics: dict[str, Any] = {
             "free_run_rmse": runs[pvs[0].name]["free_run_rmse"],
             "n_train": sum(len(s) for s in whole),
@@ -249,6 +250,13 @@ def _likely(problem: Problem, selection: Selection, inputs: Sequence[Signal]) ->
     rows = zip(inputs[: problem.n_mv], selection.chosen.structure.delays, selection.dead_times, strict=False)
     found = {s.name: [int(d), *map(int, ends)] for j, (s, d, ends) in enumerate(rows) if j not in stated}
     return {"dead_times": found} if found else {}
+
+
+def _delays(selection: Selection, inputs: Sequence[Signal]) -> dict[str, ModelDelay]:
+    """The dead time of each input in the model, and those that are as likely."""
+    likely: Sequence[tuple[int, int] | None] = selection.dead_times or [None] * len(inputs)
+    of_model = zip(inputs, selection.chosen.structure.delays, likely, strict=True)
+    return {s.name: ModelDelay(int(d), ends and (int(ends[0]), int(ends[1]))) for s, d, ends in of_model}
 
 
 def _later(selection: Selection, n_mv: int) -> float:

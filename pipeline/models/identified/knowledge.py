@@ -8,16 +8,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from loopwright.pipeline.config.known import CONTRADICTION_SDS, NO_ANSWER, NONE, Known
-from loopwright.pipeline.historian.answers import Beside
+from loopwright.pipeline.config.known import CONTRADICTION_SDS, NO_ANSWER, NONE, Known, periods_of
+from loopwright.pipeline.historian.stated_answers import Beside
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.steady_states import central_gain
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.records.record import Record
-
-DEAD_TIME_ROUNDING = 1e-6
-"""Share of a period: a dead time of whole periods in seconds is that many periods."""
 
 Model = TypeVar("Model", bound=Dynamics)
 Against = frozenset[int]
@@ -55,10 +52,7 @@ class Knowledge:
         for one in (k for k in known if k.pv in pvs):
             i, j = pvs.index(one.pv), inputs.index(one.input)
             low, high = (end * float(scales.v_scale[j] / scales.y_scale[i]) for end in one.gains)
-            delays = None
-            if one.dead_s is not None:
-                first, last = (int(np.floor(s / period_s + DEAD_TIME_ROUNDING)) for s in one.dead_s)
-                delays = first, last
+            delays = None if one.dead_s is None else periods_of(one, period_s)
             pairs.append(Pair(i, j, low, high, one.sign == NONE, delays))
         return cls(tuple(pairs), len(pvs))
 
@@ -157,10 +151,26 @@ NOTHING_KNOWN = Knowledge()
 AGREES, OPEN, MODEL, CONTRADICTED, UNUSED = "agrees", "open", "model", "contradicted", "unused"
 
 
+@dataclass(frozen=True, slots=True)
+class ModelDelay:
+    """The dead time of an input in the model, ``periods``, and the least and most that are as ``likely`` [periods].
+
+    None where no others were compared.
+    """
+
+    periods: int
+    likely: tuple[int, int] | None = None
+
+
 def known_figures(
-    statements: Sequence[Beside], gains: Mapping[str, Mapping[str, Mapping[str, Any]]], record: Record
+    statements: Sequence[Beside],
+    gains: Mapping[str, Mapping[str, Mapping[str, Any]]],
+    record: Record,
+    delays: Mapping[str, ModelDelay],
 ) -> list[dict[str, Any]]:
     """For each statement: what it ``says``, the sign ``way`` of it, whether it has a ``size``, and a ``verdict``.
+
+    A dead time has a row of its own, with ``dead_s``, see ``_dead_row``; ``delays`` are those of the inputs.
 
     ``contradicted``: the record is certain of another sign or gain; ``question`` then says what to ask. ``model``: the
     model has another one, and the record is not certain. ``open``: nor does the record say so, and the statement
@@ -172,21 +182,52 @@ def known_figures(
     found = []
     for beside in statements:
         one = beside.known
-        row: dict[str, Any] = {"pv": one.pv, "input": one.input, "says": one.says}
-        row |= {"way": one.way, "size": one.gain is not None}
-        if one.pv not in gains:
-            found.append({**row, "verdict": UNUSED})
-            continue
-        of = gains[one.pv][one.input]
-        direct, sd = beside.answer or (None, None)
-        row |= {"gain": of["gain"], "spread": of["spread"], "rate": of["rate"], "direct": direct, "sd": sd}
-        if beside.question:
-            found.append({**row, "verdict": CONTRADICTED, "question": beside.question})
-        elif _other(one, of, _nothing(one, record)):
-            found.append({**row, "verdict": MODEL})
-        else:
-            found.append({**row, "verdict": AGREES if beside.agrees and one.way else OPEN})
+        if one.says_gain:
+            found.append(_gain_row(beside, gains, record))
+        if one.dead_s is not None:
+            delay = delays[one.input] if one.pv in gains else None
+            found.append(_dead_row(beside, one.dead_s, delay, alone=len(gains) == 1))
     return found
+
+
+def _gain_row(beside: Beside, gains: Mapping[str, Mapping[str, Mapping[str, Any]]], record: Record) -> dict[str, Any]:
+    """The row of a statement on sign or gain."""
+    one = beside.known
+    row: dict[str, Any] = {"pv": one.pv, "input": one.input, "says": one.says_gain}
+    row |= {"way": one.way, "size": one.gain is not None}
+    if one.pv not in gains:
+        return {**row, "verdict": UNUSED}
+    of = gains[one.pv][one.input]
+    direct, sd = beside.answer or (None, None)
+    row |= {"gain": of["gain"], "spread": of["spread"], "rate": of["rate"], "direct": direct, "sd": sd}
+    if beside.question:
+        return {**row, "verdict": CONTRADICTED, "question": beside.question}
+    if _other(one, of, _nothing(one, record)):
+        return {**row, "verdict": MODEL}
+    return {**row, "verdict": AGREES if beside.agrees and one.way else OPEN}
+
+
+def _dead_row(beside: Beside, dead_s: tuple[float, float], delay: ModelDelay | None, *, alone: bool) -> dict[str, Any]:
+    """The row of a stated dead time ``dead_s`` [s]: it has no sign, and ``verdict`` and ``question`` as others have.
+
+    ``model_s`` [s] is the model's dead time, ``likely_s`` are the least and the most of models that are as likely, and
+    ``record_s`` those that the record by itself leaves; its most is None where no answer is certain. ``alone``: the PV
+    is the only output; else its own dead time may be longer than that of the input.
+    """
+    one, period_s = beside.known, beside.period_s
+    row: dict[str, Any] = {"pv": one.pv, "input": one.input, "says": one.says_dead, "way": 0, "size": False}
+    row |= {"dead_s": list(dead_s)}
+    if delay is None:
+        return {**row, "verdict": UNUSED}
+    likely = None if delay.likely is None else [periods * period_s for periods in delay.likely]
+    left = None if beside.dead is None else list(beside.dead_s)
+    row |= {"model_s": delay.periods * period_s, "likely_s": likely, "record_s": left}
+    if beside.dead_objects:
+        return {**row, "verdict": CONTRADICTED, "question": beside.dead_question}
+    first, last = periods_of(one, period_s)
+    if delay.periods > last or (alone and delay.periods < first):
+        return {**row, "verdict": MODEL}
+    return {**row, "verdict": AGREES if beside.dead_agrees else OPEN}
 
 
 def _other(one: Known, of: Mapping[str, Any], nothing: float) -> bool:

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopwright.pipeline.errors import ModelError
-from loopwright.pipeline.historian.answers import Beside, beside_record
 from loopwright.pipeline.historian.feedback import fed_back
+from loopwright.pipeline.historian.stated_answers import Beside, beside_record
 from loopwright.pipeline.models.identified.candidates import RESTING_SHARE, misses, rests_under
 from loopwright.pipeline.models.identified.knowledge import Knowledge
 from loopwright.pipeline.models.identified.linear_search import LinearSearch, smallest_first
@@ -339,7 +339,7 @@ class StructureSearch(Groundwork[Searched]):
         # No model is bent to what the record is certain to contradict: that is asked, and answered by a person.
         dv = data.v[:, n_mv:] * scales.v_scale[n_mv:] + scales.v_center[n_mv:]
         beside = beside_record(source.known, replace(record, dv=dv) if disturbances.sure.any() else record)
-        used = [one.known for one in beside if not one.question]
+        used = [one.known for one in beside if not one.questions]
         known = Knowledge.of(used, outputs, inputs, scales, signals.period_s)
         problem = Problem(
             data, folds(record), n_mv, source.seed, self.correction or 0.0, fed_back=back, known=known, seen=in_a_loop

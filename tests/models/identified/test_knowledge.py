@@ -12,9 +12,10 @@ from closed_loop_records import LOOPS, SIGNALS, OperatedLoop
 
 from loopwright.pipeline.config.known import stated
 from loopwright.pipeline.evaluation.proof import known_rows, sign_doubts, statements
+from loopwright.pipeline.historian.stated_answers import Beside, DeadTimeBounds
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
-from loopwright.pipeline.models.identified.knowledge import Knowledge, Pair
+from loopwright.pipeline.models.identified.knowledge import Knowledge, ModelDelay, Pair, known_figures
 from loopwright.pipeline.models.identified.linear_search import smallest_first
 from loopwright.pipeline.models.identified.output_error import Fitted
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
@@ -112,14 +113,53 @@ def test_an_effect_that_the_record_is_certain_of_is_asked() -> None:
 def test_a_dead_time_limits_the_delays_on_offer() -> None:
     record, signals = made_plants.second_order(800, delay=4), made_plants.signals_of(1, 1)  # periods of 2 s
     free = {tuple(c["delays"]) for c in figures(learnt(record, signals))["candidates_tried"]}
-    short = {
-        tuple(c["delays"]) for c in figures(learnt(record, signals, ("y0", "u0", "dead 0..4")))["candidates_tried"]
+    spanned = {
+        tuple(c["delays"]) for c in figures(learnt(record, signals, ("y0", "u0", "dead 6..8")))["candidates_tried"]
     }
     exact = figures(learnt(record, signals, ("y0", "u0", "dead 8..8")))
-    assert max(free) > (2,)
-    assert max(short) <= (2,)
+    assert min(free) < (3,)
+    assert (3,) <= min(spanned) <= max(spanned) <= (4,)
     assert {tuple(c["delays"]) for c in exact["candidates_tried"]} == {(4,)}
     assert exact["gains"]["y0"]["u0"]["gain"] == pytest.approx(0.5, rel=0.02)
+    (of,) = exact["proof"]["known"]
+    assert (of["says"], of["verdict"], of["model_s"], of["way"]) == ("dead 8..8", "open", 8.0, 0)
+    assert of["record_s"][0] <= 8.0 <= of["record_s"][1]
+
+
+@pytest.mark.parametrize(("said", "least_s", "most_s"), [("dead 0..6", 10, None), ("dead 40..50", None, 26)])
+def test_a_dead_time_that_the_record_contradicts_is_a_question_and_limits_no_delay(
+    said: str, least_s: float | None, most_s: float | None
+) -> None:
+    """The dead time is 20 s, 10 periods."""
+    record, signals = made_plants.second_order(800, delay=10), made_plants.signals_of(1, 1)
+    asked = learnt(record, signals, ("y0", "u0", f"+, {said}"))
+    sign, dead = figures(asked)["proof"]["known"]
+    assert (sign["says"], sign["verdict"]) == ("+", "agrees")
+    assert (dead["says"], dead["verdict"]) == (said, "contradicted")
+    assert dead["model_s"] == pytest.approx(20.0, abs=4.0)
+    assert least_s is None or dead["record_s"][0] >= least_s
+    assert most_s is None or dead["record_s"][1] <= most_s
+    assert dead["question"] in sign_doubts(asked)
+    of_sign, of_dead = known_rows(asked)
+    assert (of_sign.holds, of_dead.holds, of_dead.because) == (True, False, dead["question"])
+    assert f"model {dead['model_s']:g} s" in of_dead.measured
+
+
+def test_a_model_later_than_said_is_open_to_doubt_where_the_record_is_not_certain() -> None:
+    gains = {name: {"u0": {"gain": 1.0, "spread": 0.1, "rate": False}} for name in ("y0", "y1")}
+    record = made_plants.two_by_two(60)
+
+    def verdict(periods: int, *pvs: str) -> dict[str, Any]:
+        beside = Beside(stated("y0", "u0", "dead 4..8"), dead=DeadTimeBounds(), period_s=2.0)
+        of_pvs = {name: gains[name] for name in pvs}
+        (row,) = known_figures([beside], of_pvs, record, {"u0": ModelDelay(periods, (1, 3))})
+        return row
+
+    assert [verdict(n, "y0")["verdict"] for n in (1, 2, 4, 5)] == ["model", "open", "open", "model"]
+    assert verdict(1, "y0", "y1")["verdict"] == "open"  # the input's delay is that of its quickest output
+    assert verdict(3, "y1")["verdict"] == "unused"
+    row = verdict(3, "y0")
+    assert (row["dead_s"], row["model_s"], row["likely_s"], row["record_s"]) == ([4, 8], 6.0, [2.0, 6.0], [0.0, None])
 
 
 @pytest.mark.parametrize(

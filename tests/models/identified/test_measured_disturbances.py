@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopwright.pipeline.config.known import Known
-from loopwright.pipeline.historian.answers import beside_record
+from loopwright.pipeline.historian.stated_answers import beside_record
 from loopwright.pipeline.models.identified.identified_part import IdentifiedPart
 from loopwright.pipeline.models.identified.measured_disturbances import Disturbances, with_levels
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord
