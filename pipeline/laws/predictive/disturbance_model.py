@@ -17,8 +17,6 @@ LOAD_SHOWN = 0.05  # share of the effect after a horizon from which on a load is
 LOAD_SURE_LATER = (0, 2)  # samples after that at which a filter of innovations is sure of it
 REST_SAMPLES = 300  # samples to come to rest
 RUNAWAY_STATE = 8.0  # scaled: a state this far off has run away
-MEAN_REST_STEPS = 10  # steps to the rest at the record's means
-LEAST_SHOWN = 1e-3  # scaled, a sample: of a load that moves the states by less a rest says nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,69 +69,24 @@ def loads_of(model: Identified, where: Where, horizon: int) -> Loads:
 
 
 @torch.no_grad()
-def held_rest(model: Identified, loads: Loads) -> Tensor:
-    """From [y, v, 1] to [x, d] (n_x + n_d, n_y + n_v + 1), scaled: where the plant rests, the loads that hold it there.
-
-        x = f(x, v + V d) + X d,      x[:n_y] = y
-
-    in the slopes of f where its mean outputs rest under the mean inputs. A model of a record whose loads wander need
-    not rest there by itself, and its law would move the MVs at the first sample. A load that shows in no output is
-    small.
-    """
-    n_y, n_x, n_v = model.n_y, model.n_x, model.n_v
-    n_d, none = loads.count, torch.zeros(n_y, 1, dtype=torch.float64)
-    z = best = torch.cat([model.at_rest(model.y_center, model.v_center), torch.zeros(n_d, dtype=torch.float64)])
-    least = torch.inf
-    for _ in range(MEAN_REST_STEPS):
-        x, d = z[:n_x], z[n_x:]
-        v = model.v_center + model.v_scale * (loads.into_v @ d)
-        left = model(torch.cat([x, v])) + loads.into_x @ d - x
-        if not float(left.norm()) < least:  # a model that bends much may have no such rest
-            break
-        least, best = float(left.norm()), z
-        z = z + _resting(*_slopes(model, x, loads.into_v @ d), loads, torch.cat([left[:, None], none]))[:, 0]
-    x, d = best[:n_x], best[n_x:]
-    a, b = _slopes(model, x, loads.into_v @ d)
-    given = torch.cat([torch.zeros(n_x, n_y).double(), b], dim=1)
-    outputs = torch.cat([torch.eye(n_y, dtype=torch.float64), torch.zeros(n_y, n_v).double()], dim=1)
-    slope = _resting(a, b, loads, torch.cat([given, outputs]))
-    middle = torch.cat([x, d]) - slope[:, :n_y] @ x[:n_y]
-    return torch.cat([slope, middle[:, None]], dim=1)
-
-
-@torch.no_grad()
 def balanced(model: Identified, loads: Loads, span: Tensor, horizon: int) -> Tensor:
     """The largest loads (n_d,) that MVs of ``span`` (n_mv,), scaled, can balance; under larger ones nothing rests.
 
     The largest load moves an output over the horizon as far as the MVs' whole ranges can.
     """
     a, b = slopes_at_rest(model)
-    by_mv, by_load = (answers(a, into, horizon)[-1, : model.n_y] for into in (b[:, : model.n_mv], _entry(b, loads)))
+    by_mv, by_load = (answers(a, into, horizon)[-1, : model.n_y] for into in (b[:, : model.n_mv], load_entry(b, loads)))
     most = by_load.abs().argmax(dim=0, keepdim=True)  # (1, n_d)
     reach = (by_mv.abs() @ span)[:, None].expand(-1, loads.count)
     return (reach.gather(0, most) / torch.clamp(by_load.abs().gather(0, most), min=1e-12))[0]
 
 
-def _entry(b: Tensor, loads: Loads) -> Tensor:
+def load_entry(b: Tensor, loads: Loads) -> Tensor:
     """How the states (n_x, n_d) move under a unit of each load, by the inputs' slopes b."""
     return b @ loads.into_v + loads.into_x
 
 
-def _resting(a: Tensor, b: Tensor, loads: Loads, given: Tensor) -> Tensor:
-    """Small changes of [x, d] (n_x + n_d, k) that balance what is ``given`` (n_x + n_y, k): to states, and of outputs.
-
-    (I - A) x - (B V + X) d = given[:n_x],  x[:n_y] = given[n_x:], by least squares with a small price of the loads.
-    """
-    n_x, n_d, n_y = len(a), loads.count, len(given) - len(a)
-    eye = torch.eye(n_x, dtype=torch.float64)
-    states = torch.cat([eye - a, -_entry(b, loads)], dim=1)
-    outputs = torch.cat([eye[:n_y], torch.zeros(n_y, n_d).double()], dim=1)
-    price = LEAST_SHOWN * torch.eye(n_x + n_d, dtype=torch.float64)[n_x:]
-    wanted = torch.cat([given, torch.zeros(n_d, given.shape[1]).double()])
-    return torch.linalg.pinv(torch.cat([states, outputs, price])) @ wanted
-
-
-def _slopes(model: Identified, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+def slopes_of(model: Identified, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
     """Slopes (n_x, n_x) and (n_x, n_v) of the model at x (n_x,) and v (n_v,), scaled."""
     bend = model.w2 * (1 - torch.tanh(model.w1 @ torch.cat([x, v]) + model.b1) ** 2)
     return model.a + bend @ model.w1[:, : model.n_x], model.b + bend @ model.w1[:, model.n_x :]
@@ -149,7 +102,7 @@ def slopes_at_rest(model: Identified) -> tuple[Tensor, Tensor]:
     for _ in range(REST_SAMPLES):
         x = model(torch.cat([x, model.v_center]))
     x = x if bool((x.abs() < RUNAWAY_STATE).all()) else start
-    return _slopes(model, x, torch.zeros(model.n_v, dtype=torch.float64))
+    return slopes_of(model, x, torch.zeros(model.n_v, dtype=torch.float64))
 
 
 def answers(a: Tensor, into: Tensor, n: int) -> Tensor:

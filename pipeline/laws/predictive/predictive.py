@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
-from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, held_rest, loads_of
-from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
+from loopwright.pipeline.laws.predictive.cold_rest import BentRest, bent_rest, held_rest
+from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, loads_of
+from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of, product
 from loopwright.pipeline.laws.predictive.horizon_check import AnswerTimes, horizon_for, mvs_of, refuse_unstable
 from loopwright.pipeline.laws.predictive.observer import Noises, Observer, StateEstimate, load_variance
 from loopwright.pipeline.laws.predictive.params import (
@@ -73,6 +74,7 @@ class Predictive(ControlLaw):
     y_center: Tensor  # (n_cv,)
     y_scale: Tensor  # (n_cv,)
     largest: Tensor  # (n_d,) scaled load of a rest
+    bent: Tensor  # (BENDS, n_a) of a network's rests; empty without one
     follow: Tensor  # (n_dv,) of the level of each measured disturbance
     load_scale: Tensor  # [mv] of loads at MVs, [pv a period] of loads at outputs; of a scaled load
 
@@ -165,11 +167,14 @@ class Predictive(ControlLaw):
             ]
             sp = (p["sp"] - y_center[:n_cv]) / y_scale[:n_cv]
             starts = {"held": given @ rest.T, "free": given @ free.T}
+            if bent is not None:
+                starts |= {"straight": given @ bent.straight.T, "bends": given @ bent.into.T}
             return {"y": y, "sp": sp, "z": z, "v": v, **starts, "past": torch.cat(past, dim=-1), "one": one}
 
         rest, free = held_rest(model, loads), torch.cat([model.rest, torch.zeros(loads.count, model.rest.shape[1])])
         for start in (rest, free):
             start[:n_y] = torch.eye(*start[:n_y].shape, dtype=torch.float64)  # rounding moves no output
+        bent = self._bent(model, loads, rest, middle, half)
         signals = self.signals
         self.layout = {n: len(getattr(signals, n)) for n in ("sp", "pv", "dv", "mv")}
         self.inputs = AffineMap(self.layout, inputs)
@@ -278,20 +283,50 @@ class Predictive(ControlLaw):
         followed = kept["level"] + self.follow * (measured - kept["level"])
         return torch.where(kept["started"] > 0, followed, measured)
 
-    def _first(self, now: Named) -> Tensor:
-        """[x, d] (..., 1, n_a) without a past: a rest under loads, or without, which a network may hold better.
-
-        The loads are found with the slopes in the middle of the record; a network that bends much may rest by itself
-        elsewhere, where these would be wrong.
-        """
-        n_x, held = self.observer.n_x, now["held"]
-        loads = torch.minimum(torch.maximum(held[..., n_x:], -self.largest), self.largest)
-        held = torch.cat([held[..., :n_x], loads], dim=-1)
+    def _bent(self, model: Identified, loads: Loads, rest: Tensor, middle: Tensor, half: Tensor) -> BentRest | None:
+        """The map of a network's rests; None of a linear model, or where the network hardly rests."""
+        self.register_buffer("bent", torch.zeros(0, 0, dtype=torch.float64))
         if not self.observer.nonlinear:
-            return held
-        moved = [(self.observer.ahead(m, now["v"]) - m)[..., :n_x] for m in (held, now["free"])]
-        size = [(m * m).sum(-1, keepdim=True) for m in moved]
-        return torch.where(size[0] <= size[1], held, now["free"])
+            return None
+        scale, centre = model.v_scale[: len(middle)], model.v_center[: len(middle)]
+        found = bent_rest(
+            model, loads, rest, torch.stack([(middle - half - centre) / scale, (middle + half - centre) / scale], dim=1)
+        )
+        if found is not None:
+            self.bent = found.bent.T.contiguous()
+        return found
+
+    def _first(self, now: Named) -> Tensor:
+        """[x, d] (..., 1, n_a) without a past: of the rests on offer the one that moves least by itself.
+
+        A rest under the loads that the slopes in the middle of the record give, one without loads, and of a network
+        the one of ``bent_rest``: a network that bends much has other slopes elsewhere, and where it hardly rests the
+        others serve.
+        """
+        offered = [self._within(now["held"])]
+        if not self.observer.nonlinear:
+            return offered[0]
+        offered.append(now["free"])
+        if len(self.bent):
+            found = product(torch.tanh(now["bends"]), self.bent, now["straight"])
+            n_y = now["y"].shape[-1]
+            offered.append(self._within(torch.cat([now["y"], found[..., n_y:]], dim=-1)))
+        best, least = offered[0], self._moves_by(offered[0], now["v"])
+        for other in offered[1:]:
+            moves = self._moves_by(other, now["v"])
+            best, least = torch.where(moves < least, other, best), torch.minimum(moves, least)
+        return best
+
+    def _within(self, start: Tensor) -> Tensor:
+        """[x, d] with loads that MVs can balance."""
+        n_x = self.observer.n_x
+        loads = torch.minimum(torch.maximum(start[..., n_x:], -self.largest), self.largest)
+        return torch.cat([start[..., :n_x], loads], dim=-1)
+
+    def _moves_by(self, start: Tensor, v: Tensor) -> Tensor:
+        """Sum of squares (..., 1, 1) by which the states of [x, d] change in a sample under v."""
+        moved = (self.observer.ahead(start, v) - start)[..., : self.observer.n_x]
+        return (moved * moved).sum(-1, keepdim=True)
 
     def _estimated(self, now: Named, kept: Named) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """[x, d], the boost, what of the estimate goes to the next state, and the plan to begin at."""
