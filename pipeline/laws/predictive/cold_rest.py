@@ -72,7 +72,7 @@ def _resting(a: Tensor, b: Tensor, loads: Loads, given: Tensor) -> Tensor:
 
 # ------------------------------------------------------------------------------------------- the rests of a network
 SOUGHT_COLD_RESTS = 1500  # drawn, of which those that are found are fitted
-NEWTON_STEPS, LONGEST_STEP = 10, 1.0  # steps to each rest, and the farthest that one goes [scaled]
+REST_STEPS, LONGEST_STEP = 10, 1.0  # steps to each rest, and the farthest that one goes [scaled]
 FOUND_REST = 1e-6  # scaled: what a sample changes at a rest that was found
 LOADED_REST = 1.0  # scaled: largest standard deviation of what loads have moved the outputs by; each rest draws its own
 BENDS = 150  # tanh features of the map: twice as many halve its error at most, and a step takes them all
@@ -118,7 +118,7 @@ def bent_rest(model: Identified, loads: Loads, held: Tensor, reach: Tensor, seed
     begun = given @ held.T
     rests = (x[:, n_y:].abs() < RUNAWAY_STATE).all(dim=1, keepdim=True)
     z = torch.cat([y, torch.where(rests, x[:, n_y:], begun[:, n_y:n_x]), begun[:, n_x:]], dim=1)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(REST_STEPS):
         left, slope = _left(model, loads, z, v)
         step = torch.nan_to_num(torch.linalg.solve_ex(slope, left).result, 0.0, 0.0, 0.0)
         size = torch.clamp(step.abs().amax(dim=1, keepdim=True) / LONGEST_STEP, min=1.0)
@@ -137,7 +137,7 @@ def bent_rest(model: Identified, loads: Loads, held: Tensor, reach: Tensor, seed
 
 
 def _left(model: Identified, loads: Loads, z: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """What a sample changes (n, n_x) at [x, d] (n, n_x + n_d), and how [x[n_y:], d] take it back (n, n_x, ...)."""
+    """Changes (n, n_x) in a sample at [x, d] (n, n_x + n_d), and how [x[n_y:], d] take it back (n, n_x, ...)."""
     n_x = model.n_x
     x, d = z[:, :n_x], z[:, n_x:]
     acting = v + d @ loads.into_v.T
