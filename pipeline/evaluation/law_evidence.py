@@ -85,8 +85,9 @@ class ColdStart:
 
     In % of the MV's range: ``first`` at the first step, ``later`` at those after it. ``mv`` is the MV that is farthest
     off, ``at`` the levels of PVs, MVs and measured disturbances at that rest. At a quarter of the rests no step is
-    farther off than ``quarter``. ``refused`` counts the rests at which the file refuses a step. Without ``rests``
-    in the record there are no distances.
+    farther off than ``quarter``, of several files the worst one's. ``refused`` counts the rests at which a file refuses
+    a step. Without ``rests`` there are no distances: the record has none, or none within the ranges of set points and
+    MVs.
     """
 
     rests: int

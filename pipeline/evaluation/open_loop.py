@@ -161,23 +161,25 @@ def cold_start(laws: Sequence[Steps], rests: Sequence[RecordedRest], signals: Si
     """
     within = [rest for rest in rests if _within_ranges(rest, signals)]
     span = np.array([s.high - s.low for s in signals.mv])
-    found, refused = list[tuple[Array, RecordedRest]](), 0
+    found, refused, quarters = list[tuple[Array, RecordedRest]](), set[int](), list[float]()
     for law in laws:
+        own = []
         for rest in within:
             try:
-                found.append((100 * np.abs(_asked_cold(law, rest, signals) - rest.mv) / span, rest))
+                own.append((100 * np.abs(_asked_cold(law, rest, signals) - rest.mv) / span, rest))
             except LoopwrightError:
-                refused += 1
+                refused.add(rest.first)
+        found += own
+        quarters += [float(np.quantile([of.max() for of, _ in own], 0.25))] if own else []
     if not found:
-        return ColdStart(len(within), refused=refused)
+        return ColdStart(len(within), refused=len(refused))
     away = np.stack([of for of, _ in found])  # (starts, COLD_STEPS, n_mv)
     start, _, mv = np.unravel_index(int(away.argmax()), away.shape)
     rest = found[int(start)][1]
     groups = ((signals.pv, rest.pv), (signals.mv, rest.mv), (signals.dv, rest.dv))
     at = {s.name: float(v) for group, levels in groups for s, v in zip(group, levels, strict=False)}
     first, later = float(away[:, 0].max()), float(away[:, 1:].max())
-    quarter = float(np.quantile(away.max(axis=(1, 2)), 0.25))
-    return ColdStart(len(within), first, later, quarter, signals.mv[int(mv)].name, at, refused)
+    return ColdStart(len(within), first, later, max(quarters), signals.mv[int(mv)].name, at, len(refused))
 
 
 def _within_ranges(rest: RecordedRest, signals: Signals) -> bool:

@@ -300,11 +300,11 @@ def _gain_words(of: Mapping[str, Any]) -> str:
 
 def _dead_words(of: Mapping[str, Any]) -> str:
     """The dead times of model and record beside a statement, in words."""
-    words = f"model {of['model_s']:g} s"
+    words = f"the model delays it by {of['model_s']:g} s before its states"
     if of["likely_s"] is not None:
         words += f", {span_words(*of['likely_s'])} as likely"
     if of["record_s"] is None:
-        return f"{words}; too few rows to compare the record by itself"
+        return f"{words}; the record by itself says nothing: too few rows, or more periods than can be compared"
     return f"{words}; the record by itself leaves {span_words(*of['record_s'])}"
 
 

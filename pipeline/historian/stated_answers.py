@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, combinations_with_replacement, pairwise, product
 
 import numpy as np
@@ -32,17 +32,20 @@ class DeadTimeBounds:
     """The dead times [periods] that a record leaves: not less than ``least``, and not more than ``most``.
 
     ``most`` None: no answer is certain. With a dead time of d periods a move of row k first acts on row k + d + 1.
+    ``slow`` periods of the lags look like dead time to who reads it off a step test.
     """
 
     least: int = 0
     most: int | None = None
+    slow: int = 0
 
     def object_to(self, first: int, last: int) -> bool:
         """Whether no dead time from ``first`` to ``last`` [periods] is left, a period more or less.
 
-        A dead time of d periods is one from d to d + 1 in seconds.
+        A dead time of d periods is one from d to d + 1 in seconds. One that is read off a step test holds the first
+        part of the lags, which ``slow`` lets pass.
         """
-        return self.least > last + 1 or (self.most is not None and self.most < first - 1)
+        return self.least > last + 1 or (self.most is not None and self.most + self.slow < first - 1)
 
     def within(self, first: int, last: int) -> bool:
         """Whether all dead times that are left lie from ``first`` to ``last`` [periods], a period more or less."""
@@ -78,6 +81,13 @@ class Beside:
     def questions(self) -> list[str]:
         """The questions to ask; empty where nothing speaks against the statement."""
         return [words for words in (self.question, self.dead_question) if words]
+
+    @property
+    def unopposed(self) -> Known | None:
+        """The statement without the parts that the record contradicts; None where nothing is left of it."""
+        sign, gain = ("", None) if self.question else (self.known.sign, self.known.gain)
+        dead_s = None if self.dead_question else self.known.dead_s
+        return replace(self.known, sign=sign, gain=gain, dead_s=dead_s) if sign or gain or dead_s else None
 
     @property
     def agrees(self) -> bool:
@@ -163,7 +173,7 @@ CLEAR_CHI_SQUARED = (
 )
 CERTAIN_LOSS = 14.0  # chi-squared by which a dead time is worse, of which some ten are told apart: 3.7 deviations
 ZEROS_LOSS = 6.0  # chi-squared by which a plant without zeros is worse: the two coefficients that it lacks explain 2
-MORE_LAGS = 0.25  # share of the rise: so much later do five equal lags look than three
+MORE_LAGS = 0.25  # share of the rise: so much later do five equal lags look than three, and a tangent's dead time is
 RISEN = 0.632  # share of an answer's last value: a lag has risen to it after its time constant
 SHAPE_RIDGE = 1e-9  # share of the squares of shapes: lags that are as good as equal stay solvable
 
@@ -200,9 +210,10 @@ def dead_times_left(y: Array, u: Array, run: NDArray[np.int64], j: int, said: tu
     least = int(left[0])
     if without_zeros.min() <= loss.min() + ZEROS_LOSS:
         least = max(least, int((without_zeros <= without_zeros.min() + CERTAIN_LOSS).argmax()))
+    slow = int(np.ceil(MORE_LAGS * rise))
     least = max(int(least - MORE_LAGS * rise), 0)
     most = None if left[-1] == len(loss) - 1 else int(left[-1])
-    return DeadTimeBounds(least if most is None else min(least, most), most)
+    return DeadTimeBounds(least if most is None else min(least, most), most, slow)
 
 
 def _losses(model: DirectModel, j: int, latest: int) -> tuple[Array, Array, int] | None:

@@ -196,12 +196,18 @@ def _cold_starts(evidence: Evidence) -> Iterator[CheckedStatement]:
         )
 
 
+COLD_DIGITS = 3  # decimal places of a distance in %: the rest is rounding of the file
+
+
 def _cold_words(found: ColdStart) -> str:
     refused = f"refused at {found.refused} of {found.rests} rests"
     if found.first is None or found.later is None:
         return refused
-    words = f"{found.first:.2g} % at the first of {COLD_STEPS} steps, {found.later:.2g} % later"
-    words += f"; {found.quarter:.2g} % at most at a quarter of the {found.rests} rests"
+    first, later, quarter = (
+        f"{round(of or 0.0, COLD_DIGITS):.2g} %" for of in (found.first, found.later, found.quarter)
+    )
+    words = f"{first} at the first of {COLD_STEPS} steps, {later} later; {quarter} at most at a quarter of the "
+    words += f"{found.rests} rests"
     return f"{words}; {refused}" if found.refused else words
 
 
@@ -211,8 +217,9 @@ def cold_starts(evidence: Evidence) -> list[str]:
     known = {name: of for name, of in starts.items() if of is not None}
     if known and not any(of.rests for of in known.values()):
         return [
-            "The record has no rest, at which MVs and measured disturbances stay until the process variables have "
-            "settled: no law could be started cold at one."
+            "No law could be started cold at a rest of the record: MVs and measured disturbances never stay until the "
+            "process variables have settled, an MV has a few allowed values, or all rests lie outside of the ranges of "
+            "set points and MVs."
         ]
     return [
         f"{name} was started cold at rests of the record, with the record's MVs applied. The largest distance of an MV "

@@ -114,6 +114,8 @@ def known_lines(known: Sequence[Beside]) -> list[str]:
         words = f"you know of {one.known.pair}: {one.known.says}"
         if one.dead is not None:
             words += f"; the record by itself leaves {span_words(*one.dead_s)} of dead time"
+        elif one.known.dead_s is not None:
+            words += "; the dead time is not compared: the rows are too few, or more periods are said than can be"
         lines.append(words)
     return [*lines, *(question for one in known for question in one.questions)]
 

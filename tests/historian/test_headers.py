@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.files.file_reader import read_export
-from loopwright.pipeline.historian.files.headers import split_header
+from loopwright.pipeline.historian.files.headers import split_header, tags_of
 
 
 @pytest.mark.parametrize(
@@ -23,6 +24,10 @@ from loopwright.pipeline.historian.files.headers import split_header
         ("PI-3 (mbar)", "PI-3", "mbar"),
         ("QI-1 (kg/m2 s)", "QI-1", "kg/m2 s"),
         ("TI-7 (C)", "TI-7", "C"),
+        ("TT-101 (C)", "TT-101", "C"),
+        ("TICA-7 (C)", "TICA-7", "C"),
+        ("T_out (C)", "T_out", "C"),
+        ("Reactor T (K)", "Reactor T", "K"),
         ("42TIC204.PV (F)", "42TIC204.PV", "F"),
         (r"\\PI\U42:E-204/Outlet.Temp (C)", r"\\PI\U42:E-204/Outlet.Temp", "C"),
     ],
@@ -37,6 +42,18 @@ def test_a_unit_in_brackets_is_no_part_of_the_tag(header: str, tag: str, unit: s
 )
 def test_other_brackets_are_part_of_the_tag(header: str) -> None:
     assert split_header(header) == (header, "")
+
+
+def test_a_letter_among_others_is_no_unit() -> None:
+    names = tags_of(["time", "T1 (A)", "T1 (B)", "T1 (C)", "T2 (C)"])
+    assert [*names.values()] == ["time", "T1 (A)", "T1 (B)", "T1 (C)", "T2"]
+
+
+def test_a_column_has_one_role(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("time,TI-7 (C)\n0,1\n1,2\n")
+    with pytest.raises(RecordError):
+        read_export([path], ["TI-7", "TI-7 (C)"])
 
 
 def test_a_series_has_the_name_that_a_person_gave_its_column(tmp_path: Path) -> None:

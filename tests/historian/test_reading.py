@@ -86,6 +86,14 @@ def test_a_date_whose_day_is_unclear_is_refused_and_a_format_helps(tmp_path: Pat
     check(path, time_format="%m/%d/%Y %H:%M:%S")
 
 
+def test_what_is_no_date_names_no_form(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text(text(stamp=lambda t: "13/13/2024 10:00"))
+    with pytest.raises(RecordError) as refused:
+        read_export([path], NAMES)
+    assert "%" not in str(refused.value)
+
+
 @pytest.mark.parametrize("form", ["%m/%d/%Y %I:%M:%S %p", "%d/%m/%y %H:%M:%S", "%m-%d-%Y %H:%M"])
 def test_one_of_the_forms_that_a_refusal_names_is_right(form: str, tmp_path: Path) -> None:
     path = tmp_path / "x.csv"

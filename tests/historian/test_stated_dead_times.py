@@ -85,6 +85,21 @@ def test_a_slow_start_of_three_lags_is_no_dead_time() -> None:
         assert not beside(record, "dead 10..12").dead_objects
 
 
+@pytest.mark.parametrize(("lags", "words"), [((4.0,) * 4, "dead 17..20"), ((20.0, 3.0, 3.0), "dead 15..17")])
+def test_a_dead_time_off_a_step_test_holds_some_of_the_lags(lags: tuple[float, ...], words: str) -> None:
+    for seed in range(3):
+        assert not beside(by_hand(seed, lags=lags, noise=0.2), words).dead_objects
+
+
+def test_the_part_of_a_statement_that_nothing_contradicts_stays() -> None:
+    record = by_hand(0)
+    late, turned = beside(record, "+, gain 1..3, dead 60..80"), beside(record, "-, dead 10..14")
+    assert late.unopposed == stated("y", "u", "+, gain 1..3")
+    assert turned.unopposed == stated("y", "u", "dead 10..14")
+    assert beside(record, "-, dead 60..80").unopposed is None
+    assert beside(record, "+, dead 10..14").unopposed == stated("y", "u", "+, dead 10..14")
+
+
 def test_the_record_agrees_where_it_leaves_nothing_else() -> None:
     found = beside(by_hand(0, noise=0.2), "dead 8..16")
     assert found.dead_agrees
@@ -110,6 +125,8 @@ def test_a_pv_that_stands_still_or_few_rows_say_nothing() -> None:
         (DeadTimeBounds(10, None), True, False),
         (DeadTimeBounds(0, 4), False, False),
         (DeadTimeBounds(0, 3), True, False),
+        (DeadTimeBounds(0, 3, slow=1), False, False),
+        (DeadTimeBounds(0, 2, slow=1), True, False),
     ],
 )
 def test_bounds_beside_what_is_said(bounds: DeadTimeBounds, objects: bool, within: bool) -> None:

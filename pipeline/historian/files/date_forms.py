@@ -290,6 +290,8 @@ def _order(found: Sequence[re.Match[str]], first: str, tail: str, where: str) ->
     if len(orders) > 1:
         orders = _steady(numbers, orders)
     if len(orders) != 1:
+        if not orders:
+            raise RecordError(f"{where}: {first!r} is no date of a day, a month and a year; export ISO-8601 times")
         what = "month/day or day/month" if {*orders} <= {"dmy", "mdy"} else "day or year first"
         forms = [sign.join("%Y" if p == "%y" and long_year else p for p in ORDERS[o]) + tail for o in orders]
         raise RecordError(

@@ -47,6 +47,8 @@ def read_export(
     given: dict[str, list[str]] = {}  # a series keeps the name that a person gave
     for text in (*tags, *modes):
         given.setdefault(tag_named(text, columns), []).append(text)
+    if twice := [texts for texts in given.values() if len({*texts}) > 1]:
+        raise RecordError(f"{' and '.join(map(repr, dict.fromkeys(twice[0])))} name one column; give it one role")
     tags, modes = [tag_named(t, columns) for t in tags], [tag_named(t, columns) for t in modes]
     read = [_of_file(source, times, {*tags, *modes}, set(modes)) for source in sources]
     together: dict[str, list[Series]] = {}

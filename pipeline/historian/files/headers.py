@@ -17,7 +17,8 @@ BASES = (
 ONE = rf"[kmµuMGcdh]?(?:{BASES})(?:[²³0-9]|\^-?[0-9])?"
 UNIT = re.compile(rf"^{ONE}(?:[/*·.\s]?{ONE})*$")
 TEMPERATURES = {"C", "F", "K"}  # letters that are units behind the name of a temperature, as of TI-7 or Outlet.Temp
-OF_TEMPERATURE = re.compile(r"temp|(?:^|[^a-z])t[icrjxe]*[-_ ]?\d", re.IGNORECASE)
+OF_TEMPERATURE = re.compile(r"temp|(?:^|[^a-z])t[iatcrjxe]{0,4}(?:[-_ ]?\d|_|$)", re.IGNORECASE)
+LETTERED = re.compile(r"^(?P<name>.*\S)\s*\((?P<letter>[A-Z])\)$")  # T1 (A), one of several
 
 SPELLINGS = {
     "ns": (1e-9, "ns nsec nanosecond nanoseconds nanosekunde nanosekunden"),
@@ -94,6 +95,9 @@ def split_header(column: str) -> tuple[str, str]:
 def tags_of(header: Sequence[str]) -> dict[str, str]:
     """Column -> its tag without the unit; the whole header where two columns differ in their brackets only."""
     own = {column: split_header(column)[0] for column in header}
+    lettered = [match for column in header if (match := LETTERED.match(" ".join(column.split())))]
+    several = {match["name"] for match in lettered if match["letter"] not in TEMPERATURES}
+    own |= {column: column for column, tag in own.items() if tag in several}  # T1 (C) beside T1 (A) is no temperature
     times = Counter(own.values())
     return {column: tag if times[tag] == 1 else column for column, tag in own.items()}
 

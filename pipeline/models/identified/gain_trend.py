@@ -57,7 +57,7 @@ class GainTrend(NamedTuple):
 def gain_trends(model: Dynamics, data: Sequence[Stretch], n_mv: int) -> list[list[GainTrend]]:
     """The trend of each pair of output and MV, (n_y, n_mv), of a linear model; empty where no filter follows the rows.
 
-    With t from -1/2 at the first row to 1/2 at the last, the innovations of output i are
+    With t from -1/2 at the first row that counts to 1/2 at the last, gaps left out, the innovations of output i are
 
         e_i(k) = sum_j (g_j + h_j t(k)) f_ij(k) + q_j s_ij(k) + w(k)
 
@@ -82,6 +82,8 @@ def gain_trends(model: Dynamics, data: Sequence[Stretch], n_mv: int) -> list[lis
             parts = [part[:, i] for part in of or ()]
             size = max(float(np.concatenate(parts).std()), 1e-9)
             first, second = (_left_of(model, data, i, [part * (part / size) ** n for part in parts]) for n in (0, 1))
+            if first is None or second is None:
+                return []
             columns += [first, second, first * rows]
         found.append(_changes(np.column_stack(columns), left[:, i]))
     return found
@@ -99,13 +101,13 @@ def _moved(plant: Dynamics, data: Sequence[Stretch], j: int) -> list[Array] | No
     return [a[0][:, :n_y] - b[0][:, :n_y] for a, b in zip(*runs, strict=True) if a is not None and b is not None]
 
 
-def _left_of(model: Innovations, data: Sequence[Stretch], i: int, parts: Sequence[Array]) -> Array:
-    """The filter's part (n,) of ``parts`` (n,) of output i that it does not foresee; empty where it explodes."""
+def _left_of(model: Innovations, data: Sequence[Stretch], i: int, parts: Sequence[Array]) -> Array | None:
+    """The part (n,) of ``parts`` (n,) of output i that the filter does not foresee; None where it explodes."""
     column = np.arange(data[0].y.shape[1]) == i
     more = [replace(s, y=s.y + ADDED_SHARE * column * part[:, None]) for s, part in zip(data, parts, strict=True)]
     both = innovations(model, more), innovations(model, data)
     if both[0] is None or both[1] is None:
-        return np.zeros(0)
+        return None
     return np.asarray((both[0] - both[1])[:, i] / ADDED_SHARE)
 
 

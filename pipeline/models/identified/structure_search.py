@@ -339,7 +339,7 @@ class StructureSearch(Groundwork[Searched]):
         # No model is bent to what the record is certain to contradict: that is asked, and answered by a person.
         dv = data.v[:, n_mv:] * scales.v_scale[n_mv:] + scales.v_center[n_mv:]
         beside = beside_record(source.known, replace(record, dv=dv) if disturbances.sure.any() else record)
-        used = [one.known for one in beside if not one.questions]
+        used = [left for one in beside if (left := one.unopposed) is not None]
         known = Knowledge.of(used, outputs, inputs, scales, signals.period_s)
         problem = Problem(
             data, folds(record), n_mv, source.seed, self.correction or 0.0, fed_back=back, known=known, seen=in_a_loop

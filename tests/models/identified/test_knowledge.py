@@ -142,7 +142,7 @@ def test_a_dead_time_that_the_record_contradicts_is_a_question_and_limits_no_del
     assert dead["question"] in sign_doubts(asked)
     of_sign, of_dead = known_rows(asked)
     assert (of_sign.holds, of_dead.holds, of_dead.because) == (True, False, dead["question"])
-    assert f"model {dead['model_s']:g} s" in of_dead.measured
+    assert f"{dead['model_s']:g} s" in of_dead.measured
 
 
 def test_a_model_later_than_said_is_open_to_doubt_where_the_record_is_not_certain() -> None:
