@@ -9,7 +9,6 @@ from itertools import combinations, combinations_with_replacement, pairwise, pro
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular, toeplitz
-from scipy.signal import lfilter
 
 from loopwright.pipeline.config.known import CONTRADICTION_SDS, NO_ANSWER, NONE, Known, periods_of
 from loopwright.pipeline.historian.answers import COVARIANCE_RIDGE, DirectModel, blocks_to
@@ -296,6 +295,8 @@ def _cascades(shapes: Array, three: NDArray[np.int64]) -> Array:
 
 def _after(answer: Array, lag: float) -> Array:
     """An answer (rows,) behind one more lag [rows]."""
+    from scipy.signal import lfilter  # half a second to load
+
     pole = float(np.exp(-1 / lag)) if lag else 0.0
     return np.asarray(lfilter([1.0], [1.0, -pole], answer))
 
