@@ -19,7 +19,12 @@ from loopwright.serving import Controller
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted(f"{file.parent.name}/{file.stem}" for file in shipped_files.SHIPPED)
-AMPLIFYING = ("batch_reactor/predictive", "henson_seborg_cstr/predictive")
+# law whose plan amplifies rounding -> by how much its MVs may differ, times 1e-12
+AMPLIFYING = {
+    "batch_reactor/predictive": 10,
+    "henson_seborg_cstr/predictive": 10,
+    "ph_neutralization_15s/predictive": 1,  # its plan is 5e-12 off after 200 samples, its MVs are not
+}
 DEPENDENCIES = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
 Runs = Mapping[str, Mapping[str, np.ndarray]]
 
@@ -93,15 +98,15 @@ def test_every_shipped_controller_runs_in_every_environment(runs: Runs) -> None:
 def test_trajectories_agree(runs: Runs, controller: str) -> None:
     """To rounding: 1e-12 of the largest value of each MV, state and info entry.
 
-    A plan whose moves cost next to nothing amplifies the rounding before it, by some thousands in 200 samples. Of such
-    a law the MVs agree to 1e-11, its states and info to the tolerance of the parity gate.
+    A plan whose moves cost next to nothing amplifies the rounding before it, by some thousands in 200 samples. States
+    and info of such a law agree to the tolerance of the parity gate, its MVs to 1e-12 or 1e-11.
     """
     newest = runs["newest"][controller]
     assert len(np.unique(newest, axis=0)) > len(newest) / 2  # the samples move the law
     scale = np.abs(newest).max(axis=0)
     if controller in AMPLIFYING:
         n_mv = len(Controller(ROOT / "artifacts" / f"{controller}.onnx").manifest.mv)
-        scale[:n_mv] *= 10
+        scale[:n_mv] *= AMPLIFYING[controller]
         scale[n_mv:] *= GATE_TOLERANCE / 1e-12
     for name in ("floor", "here"):
         assert (np.abs(runs[name][controller] - newest) <= 1e-12 * scale).all(), name
