@@ -74,6 +74,9 @@ def _resting(a: Tensor, b: Tensor, loads: Loads, given: Tensor) -> Tensor:
 SOUGHT_COLD_RESTS = 1500  # drawn, of which those that are found are fitted
 REST_STEPS, LONGEST_STEP = 10, 1.0  # steps to each rest, and the farthest that one goes [scaled]
 FOUND_REST = 1e-6  # scaled: what a sample changes at a rest that was found
+FARTHEST_REST = (
+    80.0  # scaled: hidden states and loads of a rest; one that is farther off would weigh more than all others
+)
 LOADED_REST = 1.0  # scaled: largest standard deviation of what loads have moved the outputs by; each rest draws its own
 BENDS = 150  # tanh features of the map: twice as many halve its error at most, and a step takes them all
 REST_RIDGE = 1e-9  # share of the largest eigenvalue that keeps the fit solvable
@@ -124,7 +127,7 @@ def bent_rest(model: Identified, loads: Loads, held: Tensor, reach: Tensor, seed
         size = torch.clamp(step.abs().amax(dim=1, keepdim=True) / LONGEST_STEP, min=1.0)
         z = torch.cat([y, z[:, n_y:] + step / size], dim=1)
     left, _ = _left(model, loads, z, v)
-    good = (left.abs().amax(dim=1) < FOUND_REST) & (z.abs().amax(dim=1) < RUNAWAY_STATE * 10)
+    good = (left.abs().amax(dim=1) < FOUND_REST) & (z.abs().amax(dim=1) < FARTHEST_REST)
     into = normal(BENDS, given.shape[1])
     features = torch.cat([given, torch.tanh(given @ into.T)], dim=1)[good]
     if len(features) < 2 * features.shape[1]:
@@ -138,14 +141,9 @@ def bent_rest(model: Identified, loads: Loads, held: Tensor, reach: Tensor, seed
 
 def _left(model: Identified, loads: Loads, z: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
     """Changes (n, n_x) in a sample at [x, d] (n, n_x + n_d), and how [x[n_y:], d] take it back (n, n_x, ...)."""
-    n_x = model.n_x
-    x, d = z[:, :n_x], z[:, n_x:]
+    x, d = z[:, : model.n_x], z[:, model.n_x :]
     acting = v + d @ loads.into_v.T
-    now = torch.cat([x, acting], dim=1)
-    t = torch.tanh(now @ model.w1.T + model.b1)
-    ahead = now @ torch.cat([model.a, model.b], dim=1).T + model.c + t @ model.w2.T + d @ loads.into_x.T
-    bend = (model.w2 * (1 - t * t)[:, None, :]) @ model.w1
-    a, b = model.a + bend[..., :n_x], model.b + bend[..., n_x:]
-    eye = torch.eye(n_x, dtype=torch.float64)
-    by_load = b @ loads.into_v + loads.into_x
-    return ahead - x, torch.cat([(eye - a)[..., model.n_y :], -by_load], dim=-1)
+    ahead = model(torch.cat([x, model.v_center + model.v_scale * acting], dim=1)) + d @ loads.into_x.T
+    a, b = slopes_of(model, x, acting)
+    eye = torch.eye(model.n_x, dtype=torch.float64)
+    return ahead - x, torch.cat([(eye - a)[..., model.n_y :], -load_entry(b, loads)], dim=-1)

@@ -82,13 +82,13 @@ def balanced(model: Identified, loads: Loads, span: Tensor, horizon: int) -> Ten
 
 
 def load_entry(b: Tensor, loads: Loads) -> Tensor:
-    """How the states (n_x, n_d) move under a unit of each load, by the inputs' slopes b."""
+    """How the states (..., n_x, n_d) move under a unit of each load, by the inputs' slopes b (..., n_x, n_v)."""
     return b @ loads.into_v + loads.into_x
 
 
 def slopes_of(model: Identified, x: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Slopes (n_x, n_x) and (n_x, n_v) of the model at x (n_x,) and v (n_v,), scaled."""
-    bend = model.w2 * (1 - torch.tanh(model.w1 @ torch.cat([x, v]) + model.b1) ** 2)
+    """Slopes (..., n_x, n_x) and (..., n_x, n_v) of the model at x (..., n_x) and v (..., n_v), scaled."""
+    bend = model.w2 * (1 - torch.tanh(torch.cat([x, v], dim=-1) @ model.w1.T + model.b1) ** 2)[..., None, :]
     return model.a + bend @ model.w1[:, : model.n_x], model.b + bend @ model.w1[:, model.n_x :]
 
 

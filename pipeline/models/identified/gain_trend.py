@@ -81,7 +81,8 @@ def gain_trends(model: Dynamics, data: Sequence[Stretch], n_mv: int) -> list[lis
         for of in moved:
             parts = [part[:, i] for part in of or ()]
             size = max(float(np.concatenate(parts).std()), 1e-9)
-            first, second = (_left_of(model, data, i, [part * (part / size) ** n for part in parts]) for n in (0, 1))
+            powers = ([part * (part / size) ** n for part in parts] for n in (0, 1))
+            first, second = (_left_of(model, data, i, more, left) for more in powers)
             if first is None or second is None:
                 return []
             columns += [first, second, first * rows]
@@ -101,14 +102,15 @@ def _moved(plant: Dynamics, data: Sequence[Stretch], j: int) -> list[Array] | No
     return [a[0][:, :n_y] - b[0][:, :n_y] for a, b in zip(*runs, strict=True) if a is not None and b is not None]
 
 
-def _left_of(model: Innovations, data: Sequence[Stretch], i: int, parts: Sequence[Array]) -> Array | None:
-    """The part (n,) of ``parts`` (n,) of output i that the filter does not foresee; None where it explodes."""
-    column = np.arange(data[0].y.shape[1]) == i
+def _left_of(model: Innovations, data: Sequence[Stretch], i: int, parts: Sequence[Array], left: Array) -> Array | None:
+    """The part (n,) of ``parts`` (n,) of output i that the filter does not foresee; None where it explodes.
+
+    ``left`` (n, n_y) are the innovations without them.
+    """
+    column = np.arange(left.shape[1]) == i
     more = [replace(s, y=s.y + ADDED_SHARE * column * part[:, None]) for s, part in zip(data, parts, strict=True)]
-    both = innovations(model, more), innovations(model, data)
-    if both[0] is None or both[1] is None:
-        return None
-    return np.asarray((both[0] - both[1])[:, i] / ADDED_SHARE)
+    both = innovations(model, more)
+    return None if both is None else np.asarray((both - left)[:, i] / ADDED_SHARE)
 
 
 def _changes(columns: Array, left: Array) -> list[GainTrend]:

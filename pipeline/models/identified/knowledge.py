@@ -210,7 +210,7 @@ def _gain_row(beside: Beside, gains: Mapping[str, Mapping[str, Mapping[str, Any]
 def _dead_row(beside: Beside, dead_s: tuple[float, float], delay: ModelDelay | None, *, alone: bool) -> dict[str, Any]:
     """The row of a stated dead time ``dead_s`` [s]: it has no sign, and ``verdict`` and ``question`` as others have.
 
-    ``model_s`` [s] is the model's dead time, ``likely_s`` are the least and the most of models that are as likely, and
+    ``model_s`` [s] is the model's delay before its states, ``likely_s`` the least and most of models as likely, and
     ``record_s`` those that the record by itself leaves; its most is None where no answer is certain. ``alone``: the PV
     is the only output; else its own dead time may be longer than that of the input.
     """
