@@ -32,7 +32,7 @@ class LawStanding:
     ratio: float | None  # ``CaseStanding.times``, or to the noise floor if the bound is less: ``CaseStanding.hidden``
     step_us: float | None
     bytes: int | None  # size of the controller file
-    travel: float | None = None  # of the MVs, as ``CaseStanding.travel`` says
+    travel: float | None = None  # of the MVs on ``CaseStanding.travel_test``
     swings: str = ""  # the tests in which a closed loop swings to the end
 
 
@@ -56,7 +56,8 @@ class CaseStanding:
     reproduced: tuple[int, int]  # figures of the paper's tables: number reproduced, number measured
     grounds: Grounds | None = None  # what tests on models of the plant's record rest on
     times: str = "× NMPC"  # what ratios are to
-    travel: str = ""  # of the MVs on that test, words and unit; empty where its unit is not known
+    travel: str = ""  # of the MVs, words and unit; empty where its unit is not known
+    travel_test: str = ""  # the main test, with noise where it has any: a valve sees it, and it tells bold laws apart
     travel_bound: float | None = None  # of the perfect-model NMPC
     old_loop: str = ""  # the law that the plant was run by before
     over_old_loop: Mapping[str, float] = field(default_factory=dict)  # test -> 1 - best law's figure / old loop's
@@ -95,7 +96,8 @@ class CaseStanding:
             grounds=validation.grounds,
             times=validation.gate.times,
             travel=validation.travel_words,
-            travel_bound=validation.bounds.get(test, {}).get("nmpc", {}).get(TRAVEL),
+            travel_test=_travel_test(validation),
+            travel_bound=validation.bounds.get(_travel_test(validation), {}).get("nmpc", {}).get(TRAVEL),
             old_loop=validation.old_loop,
             over_old_loop=_over_old_loop(validation),
         )
@@ -160,6 +162,12 @@ def _ratio(validation: Validation, own: float | None) -> float | None:
     return gate_ratio(own, bound, floor) if bound < floor else ratio_to_bound(own, bound, floor)
 
 
+def _travel_test(validation: Validation) -> str:
+    """The main test with noise; as it is where it has none."""
+    noisy = validation.main.removesuffix(NOISE_SUFFIX) + NOISE_SUFFIX
+    return noisy if noisy in validation.scenarios else validation.main
+
+
 def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
     test, metric, result = validation.main, validation.metric, validation.laws[law]
     row = validation.scenarios.get(test, {}).get(law, {})
@@ -176,6 +184,8 @@ def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
         ratio=_ratio(validation, row.get(metric)),
         step_us=result.step_us,
         bytes=file.stat().st_size if file.exists() else None,
-        travel=row.get(TRAVEL) if validation.travel_words else None,
+        travel=validation.scenarios.get(_travel_test(validation), {}).get(law, {}).get(TRAVEL)
+        if validation.travel_words
+        else None,
         swings=lock_up_text(result.swings),
     )

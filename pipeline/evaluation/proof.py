@@ -300,7 +300,8 @@ def _gain_words(of: Mapping[str, Any]) -> str:
 
 def _dead_words(of: Mapping[str, Any]) -> str:
     """The dead times of model and record beside a statement, in words."""
-    words = f"the model delays it by {of['model_s']:g} s before its states"
+    seen = "never answers" if of["answer_s"] is None else f"first answers after {of['answer_s']:g} s"
+    words = f"the model {seen}; it delays the input by {of['model_s']:g} s before its states"
     if of["likely_s"] is not None:
         words += f", {span_words(*of['likely_s'])} as likely"
     if of["record_s"] is None:

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, NullLocator
 
 from loopwright.pipeline.evaluation.evidence import NotMeasuredError
 from loopwright.pipeline.evaluation.law_evidence import FormAnalysis
@@ -20,6 +22,7 @@ MOST_DRAWN_ERROR = 1.5  # times the least; farther numbers stand at the upper ed
 EDGE_ROOM = 0.06  # of the axis's height, above the numbers at the upper edge and below the least
 SPEED = "speed"  # the number of a law that a person changes first
 SPEED_COLOURS = "viridis"  # brighter is faster; even in grey
+MOST_SPEEDS = 9  # that have room for a number each beside the colours
 
 
 class TriedPoint(NamedTuple):
@@ -90,16 +93,22 @@ def travel_picture(curve: TravelCurve, law: str) -> Canvas:
     dots: Any = {"s": 34, "zorder": 3, "edgecolors": "white", "linewidths": 0.5}
     colours: Any = {"color": OTHER_COLOUR}
     if curve.speed is not None:
-        colours = {"c": np.array(curve.speed), "cmap": SPEED_COLOURS}
+        # A speed of 0.5 is as far from 1 as 2 is; a linear scale would show the slow ones in one colour.
+        span = LogNorm(min(curve.speed), max(curve.speed))
+        colours = {"c": np.array(curve.speed), "cmap": SPEED_COLOURS, "norm": span}
     every = axes.scatter(travel[near], error[near], **dots, **_some(colours, near))
     if curve.speed is not None:
-        every.set_clim(min(curve.speed), max(curve.speed))
-        canvas.colorbar(every, ax=axes, label="speed")
+        bar = canvas.colorbar(every, ax=axes, label="speed")
+        if len(speeds := sorted(set(curve.speed))) <= MOST_SPEEDS:
+            bar.set_ticks(speeds)
+            bar.ax.yaxis.set_minor_locator(NullLocator())
+        plain = FuncFormatter(lambda value, _: number(value, 2))
+        bar.ax.yaxis.set_major_formatter(plain)
+        bar.ax.yaxis.set_minor_formatter(plain)
     handles: list[Any] = [Line2D([], [], marker="o", linestyle="", color=OTHER_COLOUR, markersize=5)]
     labels = ["tried"]
     if not near.all():
-        beyond = axes.scatter(travel[~near], np.full((~near).sum(), top), marker="^", **dots, **_some(colours, ~near))
-        beyond.set_clim(every.get_clim())
+        axes.scatter(travel[~near], np.full((~near).sum(), top), marker="^", **dots, **_some(colours, ~near))
         handles.append(Line2D([], [], marker="^", linestyle="", color=OTHER_COLOUR, markersize=5))
         labels.append(f"tried, error above {top:.3g}")
     (line,) = axes.plot(travel[edge], error[edge], color="black", linewidth=1.0, drawstyle="steps-post", zorder=2)

@@ -241,6 +241,7 @@ def say_dead_times(evidence: Evidence) -> str:
     """How an engineer states the dead times that the record leaves open, each pair with their ends [s], a clause.
 
     Where a record in open loop names none, these ends lie after the model's dead time by what its tests go wrong by.
+    They stand beside the option, not in it: who copied them would say what the model says, which may be wrong.
     """
     plant, period_s = evidence.case.plant_class, evidence.case.plant_class.period_s
     part = identified_part(evidence.models)
@@ -250,14 +251,14 @@ def say_dead_times(evidence: Evidence) -> str:
         own, later = part.get("dead_times") or {}, max(_later(evidence), default=0.0)
         first = {s.name: own.get(s.name) or 0.0 for s in plant.mv_signals}
         ends = {name: (periods, periods + later) for name, periods in first.items()}
-    pairs = " ".join(
-        f'--known "{pv.name}/{name}=dead {period_s * low:.4g}..{period_s * high:.4g}"'
+    pairs = ", ".join(
+        f'--known "{pv.name}/{name}=dead FROM..TO" (by the models {period_s * low:.4g} to {period_s * high:.4g})'
         for name, (low, high) in ends.items()
         for pv in plant.sp_signals
     )
     return (
-        f"say it in seconds, as near as you know it within these ends: {pairs} of `loopwright new`, or column `known` "
-        "of the table of tags"
+        f"say it in seconds, as near as you know it, by an option of `loopwright new` or column `known` of the table "
+        f"of tags: {pairs}"
     )
 
 

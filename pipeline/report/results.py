@@ -206,7 +206,7 @@ def _tests(standing: CaseStanding) -> Table:
     table.add_row(f"{standing.test} / {standing.times[2:]}", "", *(_multiple(standing, law) for law in standing.laws))
     if standing.travel:
         travels = (standing.travel_bound, *(law.travel for law in standing.laws))
-        table.add_row(escape(f"{standing.travel}, {standing.test}"), *map(_figure, travels))
+        table.add_row(escape(f"{standing.travel}, {standing.travel_test}"), *map(_figure, travels))
     table.add_row("lock-ups", "", *(("-" if law.lock_ups is None else str(law.lock_ups)) for law in standing.laws))
     table.add_row("size", "", *map(_size, standing.laws))
     return table

@@ -84,7 +84,7 @@ def sayings(verdict: RecordJudgement, units: Mapping[str, str], known: Collectio
             words += [_settles(i, pv)] if gain else []
             words += ["gain and settling unreliable: drift or loads"] if gain and pv in verdict.unsure else []
             unknown = first is None and i.role == "mv" and (pv, i.name) not in said
-            stated = f' If you know the dead time, state it in s, as --known "{pv}/{i.name}=dead 30..50".' * unknown
+            stated = f' If you know the dead time, state it in s, as --known "{pv}/{i.name}=dead FROM..TO".' * unknown
             lines.append(f"{i.name} -> {pv}: {', '.join(words)}; is it so on the plant?{stated}")
     return lines
 

@@ -88,6 +88,9 @@ def test_the_table_shows_the_pairs_and_takes_what_is_known_of_them() -> None:
         Known("TIC-101.PV", "valve", "+", (0.5, 1.0), (0.0, 30.0)),
         Known("TIC-101.PV", "FI-7", "none"),
     )
+    taken_back = ["--tags", "tank-tags.csv", "--replace", *said(f"{MV}=")]
+    assert main(["new", "tank", "x.csv", *taken_back]) == 0  # of the table and of the plant, in one act
+    assert known() == (Known("TIC-101.PV", "FI-7", "none"),)
 
 
 def rewritten(table: Path, lines: list[dict[str, Any]]) -> None:

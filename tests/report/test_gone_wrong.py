@@ -87,7 +87,7 @@ def test_kinds_in_the_title_and_in_the_rows_are_the_same_words() -> None:
 
 def test_where_lateness_alone_is_to_blame_the_dead_time_is_asked_for_by_the_option_of_the_pair() -> None:
     found = evidence(case_of(dead_sd=1.5), *POOR_LATE)
-    assert '--known "y0/u0=dead 0..3"' in dead_time_to_state(found, "predictive")
+    assert '--known "y0/u0=dead FROM..TO" (by the models 0 to 3)' in dead_time_to_state(found, "predictive")
     assert dead_time_to_state(found, "pid") == ""
     (row,) = [r for r in own_acceptance(found) if r.what.startswith("predictive, spoilt")]
     assert (row.holds, "--known" in row.because) == (True, False)  # .317 against .333
@@ -95,14 +95,14 @@ def test_where_lateness_alone_is_to_blame_the_dead_time_is_asked_for_by_the_opti
     (row,) = [r for r in own_acceptance(worse) if r.what.startswith("predictive, spoilt")]
     assert (row.holds, "--known" in row.because) == (False, True)
     (line,) = against(worse)
-    assert '--known "y0/u0=dead 0..3"' in line["words"]
+    assert "by the models 0 to 3" in line["words"]
 
 
 def test_a_model_that_acts_late_already_is_later_still() -> None:
     part = {"dead_times": {"u0": 2.0}}
     models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
     found = replace(evidence(case_of(dead_sd=1.5), *POOR_LATE), models=models)
-    assert '--known "y0/u0=dead 2..5"' in dead_time_to_state(found, "predictive")
+    assert '--known "y0/u0=dead FROM..TO" (by the models 2 to 5)' in dead_time_to_state(found, "predictive")
 
 
 @pytest.mark.parametrize(("late", "asks"), [(LATE_ALONE_FACTOR * 0.2 * 1.01, True), (0.2 * 1.01, False)])

@@ -15,6 +15,7 @@ from loopwright.pipeline.evaluation.law_evidence import BASE, Form, LawEvidence,
 from loopwright.pipeline.evaluation.validation import CheckedStatement
 from loopwright.pipeline.evaluation.verdicts import PLAIN
 from loopwright.pipeline.report.own_acceptance import (
+    MOST_OVERSHOOT,
     against,
     beyond_reach,
     own_acceptance,
@@ -30,10 +31,17 @@ TESTS = ("held_out", "held_out_noise", "load", "spoilt")
 
 
 def law(
-    name: str, development: float, lock_ups: int = 0, top: float = 2.5, travel: float = 1.0, **mae: float
+    name: str,
+    development: float,
+    lock_ups: int = 0,
+    top: float = 2.5,
+    travel: float = 1.0,
+    over: float = 0.1,
+    **mae: float,
 ) -> LawEvidence:
-    """Evidence with these errors by test; a test ends with a tenth of its error."""
+    """Evidence with these errors by test; a test ends with a tenth of its error. ``over``: overshoot in ``spoilt``."""
     rows = {test: {"mae": mae.get(test, 0.1), "max_asse": mae.get(test, 0.1) / 10} for test in TESTS}
+    rows = {test: row | {"overshoot": over if test == "spoilt" else 0.0} for test, row in rows.items()}
     form = Form({}, (), {test: OverSeeds(row, row, row, {"0": row}) for test, row in rows.items()})
     return LawEvidence(
         LawMetrics(
@@ -87,6 +95,13 @@ def test_the_best_law_must_settle_in_every_test() -> None:
         f"≤ {UNREACHED_ERROR * asked:.3g} m", "0.034 m in test spoilt", True
     )  # fmt: skip
     assert (bad.measured, bad.holds) == ("0.036 m in test spoilt", False)
+
+
+@pytest.mark.parametrize(("over", "holds"), [(MOST_OVERSHOOT - 0.01, True), (MOST_OVERSHOOT + 0.01, False)])
+def test_the_best_law_must_not_overshoot_far_on_plants_gone_wrong(over: float, holds: bool) -> None:
+    of = row(evidence(law("predictive", 1.0, over=over), law("pid", 2.0, held_out=0.12)), "overshoot")
+    assert (of.holds, of.measured) == (holds, f"{100 * over:.0f} % in test spoilt")
+    assert bool(of.because) is not holds  # and then says what makes it calmer
 
 
 @pytest.mark.parametrize(

@@ -64,8 +64,9 @@ def test_of_several_controlled_variables_all_is_in_shares() -> None:
 
 
 def law(name: str, travel: float) -> LawEvidence:
-    row = {"mae": 0.1, "max_asse": 0.0, TRAVEL: travel}
-    form = Form({}, (), {test: OverSeeds(row, row, row, {"0": row}) for test in TESTS})
+    """A law that moves half as much again under noise."""
+    rows = {test: {"mae": 0.1, "max_asse": 0.0, TRAVEL: travel * (1.5 if "noise" in test else 1.0)} for test in TESTS}
+    form = Form({}, (), {test: OverSeeds(row, row, row, {"0": row}) for test, row in rows.items()})
     return LawEvidence(LawMetrics(name, name, "mae", (0,), 0, {BASE: form}, development={"0": 1.0}), Path())
 
 
@@ -83,7 +84,7 @@ def test_the_table_of_a_run_has_the_travel_with_its_unit() -> None:
     found, file = evidence(controllers_of_a_lag({})), Path("artifacts/it") / FILE
     file.parent.mkdir(parents=True)
     file.write_text(validation(found, judge(found, PLAIN)).to_json())
-    assert ["MV", "travel", "[V],", "held_out", "5.0000", "12.5000", "40.0000"] in shown()
+    assert ["MV", "travel", "[V],", "held_out_noise", "5.0000", "18.7500", "60.0000"] in shown()
     assert Validation.read(file).travel_words == "MV travel [V]"
     tree = json.loads(file.read_text())
     del tree["titles"]["figures"][TRAVEL]  # of an older release, which summed whatever units there were

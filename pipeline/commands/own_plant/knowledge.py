@@ -121,7 +121,7 @@ def _same(end: float | None, seen: float) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Stated:
-    """The statements, one a pair; ``--known PV/INPUT=`` takes those on the ``forgotten`` pairs back."""
+    """The statements, one a pair; ``--known PV/INPUT=`` takes those on the ``forgotten`` pairs back, wherever made."""
 
     known: tuple[Known, ...] = ()
     forgotten: frozenset[tuple[str, str]] = field(default_factory=frozenset)
@@ -133,7 +133,7 @@ def stated_of(tags: Sequence[Tag], options: Sequence[str]) -> Stated:
     TableError with all mistakes of the table, RecordError for one of the options and for what contradicts itself.
     """
     pvs, inputs = ([t for t in tags if t.role in roles] for roles in (("pv",), ("mv", "dv")))
-    found, forgotten = list(_of_table(tags, pvs)), set[tuple[str, str]]()
+    found, forgotten = list[Known](), set[tuple[str, str]]()
     pairs = {
         f"{a}/{b}": (pv.name, given.name)
         for pv in pvs
@@ -155,6 +155,8 @@ def stated_of(tags: Sequence[Tag], options: Sequence[str]) -> Stated:
             found.append(stated(*names, said))
         except ValueError as error:
             raise RecordError(f"--known {text}: {error}") from None
+    # What an option takes back is taken back of the table too, which `new` may have written from an earlier option.
+    found = [one for one in _of_table(tags, pvs) if (one.pv, one.input) not in forgotten] + found
     try:
         return Stated(checked(together(found), tags), frozenset(forgotten))
     except ValueError as error:

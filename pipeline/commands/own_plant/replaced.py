@@ -60,7 +60,9 @@ def known_kept(plant: str, said: Stated, tags: Sequence[Tag]) -> tuple[tuple[Kno
     names = {role: {t.name for t in tags if t.role in roles} for role, roles in (("pv", {"pv"}), ("in", {"mv", "dv"}))}
     anew = {(one.pv, one.input) for one in said.known} | said.forgotten
     kept = [k for k in old if (k.pv, k.input) not in anew and k.pv in names["pv"] and k.input in names["in"]]
-    return checked((*kept, *said.known), tags), [f"known: {k.pair}={k.says}" for k in kept]
+    return checked((*kept, *said.known), tags), [
+        f"known: {k.pair}={k.says} (--known '{k.pair}=' takes it back)" for k in kept
+    ]
 
 
 def wishes_lost(plant: str, entries: Mapping[str, Mapping[str, Any]], screening: Path) -> list[str]:

@@ -183,7 +183,8 @@ class IdentifiedPart(Part):
             for mv, trend in zip(source.signals.mv, row, strict=True):
                 of = gain_table[pv.name][mv.name]
                 of["trend"] = trend._asdict() | {"certain": trend.certain, "at_end": trend.at_end * of["gain"]}
-        delays = _delays(selection, inputs)
+        answers = answer_figures(fitted.model.plant, structure.delays, problem.data, pvs, inputs)
+        delays = _delays(selection, inputs, answers["first_answers"])
         said = {"known": known_figures(searched.known, gain_table, record, delays)} if searched.known else {}
         metrics: dict[str, Any] = {
             "free_run_rmse": runs[pvs[0].name]["free_run_rmse"],
@@ -193,7 +194,7 @@ class IdentifiedPart(Part):
             "outputs": runs,
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
             "gains": gain_table,
-            **answer_figures(fitted.model.plant, structure.delays, problem.data, pvs, inputs),
+            **answers,
             "proof": _proof(searched, record, proven, runs, noise * scales.y_scale)
             | ({"sign_margin": dict.fromkeys(names[:n_cv], margin)} if np.isfinite(margin) else {})
             | said
@@ -252,11 +253,18 @@ def _likely(problem: Problem, selection: Selection, inputs: Sequence[Signal]) ->
     return {"dead_times": found} if found else {}
 
 
-def _delays(selection: Selection, inputs: Sequence[Signal]) -> dict[str, ModelDelay]:
-    """The dead time of each input in the model, and those that are as likely."""
+def _delays(
+    selection: Selection, inputs: Sequence[Signal], first: Mapping[str, Mapping[str, int | None]]
+) -> dict[str, ModelDelay]:
+    """The delay of each input in the model, those that are as likely, and the ``first`` answers, PV -> input."""
     likely: Sequence[tuple[int, int] | None] = selection.dead_times or [None] * len(inputs)
     of_model = zip(inputs, selection.chosen.structure.delays, likely, strict=True)
-    return {s.name: ModelDelay(int(d), ends and (int(ends[0]), int(ends[1]))) for s, d, ends in of_model}
+    return {
+        s.name: ModelDelay(
+            int(d), ends and (int(ends[0]), int(ends[1])), {pv: answers[s.name] for pv, answers in first.items()}
+        )
+        for s, d, ends in of_model
+    }
 
 
 def _later(selection: Selection, n_mv: int) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -153,13 +153,15 @@ AGREES, OPEN, MODEL, CONTRADICTED, UNUSED = "agrees", "open", "model", "contradi
 
 @dataclass(frozen=True, slots=True)
 class ModelDelay:
-    """The dead time of an input in the model, ``periods``, and the least and most that are as ``likely`` [periods].
+    """The delay of an input before the model's states, ``periods``, and the least and most as ``likely`` [periods].
 
-    None where no others were compared.
+    None where no others were compared. ``first_answers`` are the periods after which each PV first moves, None where it
+    never does: one more than the delay of a state that answers at once.
     """
 
     periods: int
     likely: tuple[int, int] | None = None
+    first_answers: Mapping[str, int | None] = field(default_factory=dict)
 
 
 def known_figures(
@@ -186,7 +188,7 @@ def known_figures(
             found.append(_gain_row(beside, gains, record))
         if one.dead_s is not None:
             delay = delays[one.input] if one.pv in gains else None
-            found.append(_dead_row(beside, one.dead_s, delay, alone=len(gains) == 1))
+            found.append(_dead_row(beside, one.dead_s, delay))
     return found
 
 
@@ -207,12 +209,13 @@ def _gain_row(beside: Beside, gains: Mapping[str, Mapping[str, Mapping[str, Any]
     return {**row, "verdict": AGREES if beside.agrees and one.way else OPEN}
 
 
-def _dead_row(beside: Beside, dead_s: tuple[float, float], delay: ModelDelay | None, *, alone: bool) -> dict[str, Any]:
+def _dead_row(beside: Beside, dead_s: tuple[float, float], delay: ModelDelay | None) -> dict[str, Any]:
     """The row of a stated dead time ``dead_s`` [s]: it has no sign, and ``verdict`` and ``question`` as others have.
 
-    ``model_s`` [s] is the model's delay before its states, ``likely_s`` the least and most of models as likely, and
-    ``record_s`` those that the record by itself leaves; its most is None where no answer is certain. ``alone``: the PV
-    is the only output; else its own dead time may be longer than that of the input.
+    ``model_s`` [s] is the model's delay before its states, ``answer_s`` [s] the time from a move to the PV's first
+    answer, as everywhere, ``likely_s`` the least and most delay of models as likely, and ``record_s`` those that the
+    record by itself leaves; its most is None where no answer is certain. Slow states hide a dead time, so that it lies
+    anywhere from the delay up to the period before the first answer: the model contradicts what is said outside of it.
     """
     one, period_s = beside.known, beside.period_s
     row: dict[str, Any] = {"pv": one.pv, "input": one.input, "says": one.says_dead, "way": 0, "size": False}
@@ -221,11 +224,13 @@ def _dead_row(beside: Beside, dead_s: tuple[float, float], delay: ModelDelay | N
         return {**row, "verdict": UNUSED}
     likely = None if delay.likely is None else [periods * period_s for periods in delay.likely]
     left = None if beside.dead is None else list(beside.dead_s)
+    answer = delay.first_answers.get(one.pv)
     row |= {"model_s": delay.periods * period_s, "likely_s": likely, "record_s": left}
+    row |= {"answer_s": None if answer is None else answer * period_s}
     if beside.dead_objects:
         return {**row, "verdict": CONTRADICTED, "question": beside.dead_question}
     first, last = periods_of(one, period_s)
-    if delay.periods > last or (alone and delay.periods < first):
+    if delay.periods > last or (answer is not None and answer - 1 < first):
         return {**row, "verdict": MODEL}
     return {**row, "verdict": AGREES if beside.dead_agrees else OPEN}
 

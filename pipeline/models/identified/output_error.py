@@ -50,7 +50,12 @@ class Equations:
             solved.append((back, mean))
             h = h - cross @ back
             g = g - cross @ mean
-        step = linalg.solve(h, g, assume_a="pos", check_finite=False) if len(g) else g
+        step = g
+        if len(g):  # scipy's own solver warns of sums that are nearly singular, which the damping of a next step mends
+            factor, failed = lapack.dpotrf(h, clean=False)
+            if failed:
+                raise linalg.LinAlgError("the sums of the parameters are not positive definite")
+            step = lapack.dpotrs(factor, g)[0]
         return step, [mean - back @ step for back, mean in solved]
 
 

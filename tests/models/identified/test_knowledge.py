@@ -149,14 +149,16 @@ def test_a_model_later_than_said_is_open_to_doubt_where_the_record_is_not_certai
     gains = {name: {"u0": {"gain": 1.0, "spread": 0.1, "rate": False}} for name in ("y0", "y1")}
     record = made_plants.two_by_two(60)
 
-    def verdict(periods: int, *pvs: str) -> dict[str, Any]:
+    def verdict(periods: int, *pvs: str, answer: int = 1) -> dict[str, Any]:
+        """The row; the PV first answers ``answer`` periods after a delay of ``periods``."""
         beside = Beside(stated("y0", "u0", "dead 4..8"), dead=DeadTimeBounds(), period_s=2.0)
         of_pvs = {name: gains[name] for name in pvs}
-        (row,) = known_figures([beside], of_pvs, record, {"u0": ModelDelay(periods, (1, 3))})
+        (row,) = known_figures([beside], of_pvs, record, {"u0": ModelDelay(periods, (1, 3), {"y0": periods + answer})})
         return row
 
     assert [verdict(n, "y0")["verdict"] for n in (1, 2, 4, 5)] == ["model", "open", "open", "model"]
-    assert verdict(1, "y0", "y1")["verdict"] == "open"  # the input's delay is that of its quickest output
+    assert verdict(1, "y0", answer=2)["verdict"] == "open"  # slow states hide a dead time
+    assert verdict(1, "y0", "y1", answer=2)["verdict"] == "open"  # the input's delay is that of its quickest output
     assert verdict(3, "y1")["verdict"] == "unused"
     row = verdict(3, "y0")
     assert (row["dead_s"], row["model_s"], row["likely_s"], row["record_s"]) == ([4, 8], 6.0, [2.0, 6.0], [0.0, None])
