@@ -18,6 +18,7 @@ from loopwright.serving.controller_file import DIGEST_KEY, file_digest, read_con
 from loopwright.serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
 from loopwright.serving.graph.audit import audit
 from loopwright.serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
+from loopwright.serving.operating import Operate
 from loopwright.serving.ranges import numbers
 
 LONGEST_STEP_S = 1.0  # a fork waits no longer for a step
@@ -111,7 +112,15 @@ class Controller:
         return np.zeros(self.manifest.n_state)
 
     def step(
-        self, *, sp: ArrayLike, pv: ArrayLike, mv_applied: ArrayLike, state: ArrayLike, dv: ArrayLike | None = None
+        self,
+        *,
+        sp: ArrayLike,
+        pv: ArrayLike,
+        mv_applied: ArrayLike,
+        state: ArrayLike,
+        dv: ArrayLike | None = None,
+        operate: ArrayLike | None = None,
+        fresh: ArrayLike | None = None,
     ) -> Step:
         """One step of the law, in engineering units.
 
@@ -124,18 +133,24 @@ class Controller:
             The MV that the plant really received over the last period, shape (n_mv,).
         state
             ``state`` of the last step, or ``cold_state()``; shape (n_state,).
+        operate
+            What operators have changed, shape (n_operate,), as the manifest's ``operate`` lists it; None: its defaults.
+        fresh
+            1 for each process variable whose reading is new and good, 0 for one that is neither, shape (n_pv,); None:
+            all are. The number in ``pv`` must be finite all the same, and is not used.
 
         Raises
         ------
         ContractError
-            An input has the wrong shape or type, or is missing.
+            An input has the wrong shape or type, or is missing; an entry of ``operate`` is outside its engineered
+            range, or ``fresh`` is neither 0 nor 1.
         SampleError
             An input is not finite: no MV is computed from it.
         OutputError
             The law's output is not finite, lies outside the MV's range, or is further from ``mv_applied`` than the
             MV moves in a period (``max_move``).
         """
-        given = (sp, pv, dv, mv_applied, state)
+        given = (sp, pv, dv, mv_applied, state, *self._operated(operate, fresh))
         with self._lock:
             for place, name, buffer, shape in self._inputs:
                 value = given[place]
@@ -219,6 +234,8 @@ class Controller:
         self._out, outs = _vectors([len(m.mv), m.n_state, len(m.info)])
         starts = [(p.ctypes.data - self._out.ctypes.data) // 8 for p in outs]
         self._cuts = (len(m.mv), starts[1], starts[1] + m.n_state, starts[2], starts[2] + len(m.info))
+        self._operate = Operate(m.operate) if "operate" in m.inputs or "fresh" in m.inputs else None
+        self._all_fresh = np.ones(len(m.pv))
         self._ranges = [(s.low, s.high, s.values) for s in m.mv]
         begins = next(
             ((part.ctypes.data - self._in.ctypes.data) // 8 for _, n, part, _ in self._inputs if n == "mv_applied"), 0
@@ -233,11 +250,23 @@ class Controller:
                 self._binding.bind_output(name, "cpu", 0, np.float64, part.shape, part.ctypes.data)
         self._reset()
 
+    def _operated(self, operate: ArrayLike | None, fresh: ArrayLike | None) -> tuple[Any, Any]:
+        """``operate`` and ``fresh``, checked; their defaults where there are none."""
+        if self._operate is None:
+            return None, None
+        operate = self._operate.default if operate is None else self._operate.checked(operate)
+        if fresh is None:
+            return operate, self._all_fresh
+        known = self._vector("fresh", fresh, len(self.manifest.pv))
+        if not ((known == 0) | (known == 1)).all():
+            raise ContractError(f"fresh is {known.tolist()}; each is 1 for a new and good reading, or 0")
+        return operate, known
+
     def _reset(self) -> None:
         """Inputs that any law can be warmed with: the middle of each range, no past."""
         with self._lock:
             for _, name, buffer, _ in self._inputs:
-                buffer[...] = [s.middle for s in self.manifest.signals(name)] or 0.0
+                buffer[...] = self.manifest.usual(name)
 
     # ------------------------------------------------------------------ refusals
     def _vector(self, name: str, value: object, length: int) -> Array:
@@ -257,7 +286,7 @@ class Controller:
     def _allowed(self, name: str) -> str:
         if name == "state":
             return f"shape ({self.manifest.n_state},), from the last step or cold_state()"
-        signals = self.manifest.signals(name)
+        signals = self.manifest.signals("pv" if name == "fresh" else name)
         return f"shape ({len(signals)},): {', '.join(f'{s.name} [{s.unit}]' for s in signals)}"
 
     def _check_finite(self) -> None:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from itertools import pairwise
-from typing import Any, Self
+from typing import Any, Literal, Self, TypeAlias, get_args
 
 from loopwright.serving.errors import ArtifactError
 from loopwright.serving.fields import MAX_DIGITS, refused, shown
@@ -14,7 +15,7 @@ from loopwright.serving.words import ACTS
 
 MANIFEST_SCHEMA = 1  # of the manifest: a runtime refuses another
 MANIFEST_KEY = "loopwright.manifest"
-INPUTS = ("sp", "pv", "dv", "mv_applied", "state")
+INPUTS = ("sp", "pv", "dv", "mv_applied", "state", "operate", "fresh")
 MAX_CHARACTERS = 2**20  # of a manifest
 MAX_NAME = 200  # characters
 MAX_MANIFEST_DEPTH = 20  # of lists and objects in each other
@@ -107,13 +108,81 @@ class Signal:
         )
 
 
+# ------------------------------------------------------------------------------- what operators change of a running law
+Group: TypeAlias = Literal["cv", "mv", "law"]
+What: TypeAlias = Literal[
+    "use", "track", "low", "high", "rank", "max_move", "rest", "rest_use", "cost", "speed", "caution"
+]
+SWITCHES = frozenset({"use", "track", "rest_use"})
+OF_GROUP: Mapping[str, frozenset[str]] = {
+    "cv": frozenset({"use", "track", "low", "high", "rank", "cost"}),
+    "mv": frozenset({"use", "low", "high", "max_move", "rest", "rest_use", "cost"}),
+    "law": frozenset({"speed", "caution"}),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class OperateEntry:
+    """One number of ``operate``: what of which signal, its default, and the engineered range that it stays within.
+
+    ``use`` 0 takes a signal out; ``track`` 0 leaves a controlled variable alone within ``low`` and ``high``; ``rank``
+    1 keeps its range before 2; ``max_move`` is a period's; ``rest`` is where an MV goes that nothing asks for, where
+    ``rest_use`` is 1; ``cost`` counts per unit of the signal and period, beside those of the other signals; ``speed``
+    and ``caution`` multiply those of the law.
+    """
+
+    group: Group
+    signal: str  # empty for the whole law
+    what: What
+    unit: str
+    default: float
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        if self.what not in OF_GROUP.get(self.group, ()) or bool(self.signal) != (self.group != "law"):
+            raise ArtifactError(f"operate has {self.group!r} {self.signal!r} {self.what!r}, which no law has")
+        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= self.default <= self.high):
+            raise ArtifactError(
+                f"operate: {self.name} is {self.default} within [{self.low}, {self.high}]; both ends must be finite, "
+                "and the default between them"
+            )
+
+    @property
+    def name(self) -> str:
+        """``TIC-1.low``; of the whole law ``speed``."""
+        return f"{self.signal}.{self.what}" if self.signal else self.what
+
+    def to_dict(self) -> dict[str, Any]:
+        """The entry as JSON-ready values."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, row: Mapping[str, Any]) -> Self:
+        """The entry that ``to_dict`` wrote; TypeError or ValueError if it is none."""
+        names = [f.name for f in fields(cls)]
+        if sorted(row) != sorted(names):
+            raise ValueError(f"an entry of operate has {', '.join(sorted(map(str, row)))}; it must have {names}")
+        for name in ("group", "signal", "what", "unit"):
+            if not isinstance(row[name], str):
+                raise TypeError(f"an entry of operate has the {name} {row[name]!r}; it must be a text")
+        for name in ("default", "low", "high"):
+            if type(row[name]) not in (int, float):
+                raise TypeError(f"an entry of operate has the {name} {row[name]!r}; it must be a number")
+        if row["what"] not in get_args(What):
+            raise ValueError(f"an entry of operate is {row['what']!r}; allowed are {', '.join(get_args(What))}")
+        return cls(**{**row, **{name: float(row[name]) for name in ("default", "low", "high")}})
+
+
+# --------------------------------------------------------------------------------------------------------- the manifest
 @dataclass(frozen=True, slots=True)
 class Manifest:
     """The contract of one controller.
 
-    ``inputs`` names the graph's inputs, a subset of sp, pv, dv, mv_applied, state: a graph has
+    ``inputs`` names the graph's inputs, a subset of sp, pv, dv, mv_applied, state, operate, fresh: a graph has
     only those that its law uses. ``info`` names the entries of the info vector.
-    ``provenance`` says where the controller comes from, ``evidence`` how its validation went.
+    ``provenance`` says where the controller comes from, ``evidence`` how its validation went. ``operate`` are the
+    numbers that operators may change; ``fresh`` is 1 for each process variable with a new and good reading.
     """
 
     case: str
@@ -129,6 +198,7 @@ class Manifest:
     schema: int = MANIFEST_SCHEMA
     provenance: dict[str, Any] = field(default_factory=dict)
     evidence: dict[str, Any] = field(default_factory=dict)
+    operate: tuple[OperateEntry, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("sp", "pv", "dv", "mv"):
@@ -148,6 +218,11 @@ class Manifest:
             raise ArtifactError(
                 f"the manifest's inputs are {list(self.inputs)}; allowed are {', '.join(INPUTS)}, each once"
             )
+        if ("operate" in self.inputs) > bool(self.operate):
+            raise ArtifactError("the manifest's law reads operate, but the manifest has no entries of it")
+        names = [entry.name for entry in self.operate]
+        if len(set(names)) < len(names):
+            raise ArtifactError(f"the manifest's operate has a name twice: {', '.join(names)}")
         limited = [s.name for s in self.mv if s.most < math.inf]
         if limited and "mv_applied" not in self.inputs:
             raise ArtifactError(
@@ -161,7 +236,16 @@ class Manifest:
 
     def sizes(self) -> dict[str, int]:
         """Length of each input, whether the graph uses it or not."""
-        return {n: self.n_state if n == "state" else len(self.signals(n)) for n in INPUTS}
+        others = {"state": self.n_state, "operate": len(self.operate), "fresh": len(self.pv)}
+        return {n: others.get(n, len(self.signals(n))) for n in INPUTS}
+
+    def usual(self, name: str) -> list[float]:
+        """A value of each number of an input that any law takes: the middle of each range, no past, the defaults."""
+        if name == "operate":
+            return [entry.default for entry in self.operate]
+        if name == "fresh":
+            return [1.0 for _ in self.pv]
+        return [s.middle for s in self.signals(name)] or [0.0] * self.sizes()[name]
 
     def to_json(self, *, indent: int | None = None) -> str:
         """The manifest as JSON, keys in the order of the fields."""
@@ -170,6 +254,10 @@ class Manifest:
             value = getattr(self, f.name)
             if f.name in {"sp", "pv", "dv", "mv"}:
                 value = [s.to_dict() for s in value]
+            if f.name == "operate":
+                if not value:  # a runtime of before reads files without it
+                    continue
+                value = [e.to_dict() for e in value]
             row[f.name] = value
         return json.dumps(row, indent=indent, allow_nan=False)
 
@@ -185,7 +273,7 @@ class Manifest:
                 f"the manifest has schema {str(schema)[:MAX_NAME]}; this runtime reads schema {MANIFEST_SCHEMA}: "
                 "export the controller again or use the matching release of loopwright"
             )
-        missing = [f.name for f in fields(cls) if f.name not in row]
+        missing = [f.name for f in fields(cls) if f.name not in row and f.name != "operate"]
         if missing:
             raise ArtifactError(f"the manifest lacks {', '.join(missing)}")
         unknown = sorted(set(row) - {f.name for f in fields(cls)})
@@ -205,6 +293,7 @@ class Manifest:
                 schema=MANIFEST_SCHEMA,
                 provenance=_dict(row["provenance"]),
                 evidence=_dict(row["evidence"]),
+                operate=tuple(OperateEntry.from_dict(_dict(e)) for e in _list(row.get("operate", []))),
                 **signals,
             )
         except KeyError as error:
@@ -217,7 +306,7 @@ def _increasing(values: tuple[float, ...]) -> bool:
     return all(a < b for a, b in pairwise(values))
 
 
-# ---------------------------------------------------------------------- JSON, strictly
+# ------------------------------------------------------------------------------------------------------- JSON, strictly
 def strictly(text: str, most: int = MAX_CHARACTERS) -> Any:
     """JSON in which readers may not differ: no entry twice, no number that is none, nothing too deep.
 

@@ -33,6 +33,8 @@ class VectorizedController:
         self._mv, self._next = places.pop("mv"), places.pop("state_next")
         self._places = places
         self._given = np.zeros((n, controller.width))
+        for name in {"operate", "fresh"} & set(places):  # as they are by default
+            self._given[:, self._places.pop(name)] = controller.manifest.usual(name)
 
     def cold_state(self) -> Array:
         """States of zeros, shape (n, n_state): no past."""

@@ -20,7 +20,8 @@ from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopwrightError
-from loopwright.serving.manifest import INPUTS, SENSITIVE, Manifest, Signal
+from loopwright.serving.manifest import INPUTS, SENSITIVE, SWITCHES, Manifest, Signal
+from loopwright.serving.operating import Operate
 
 GATE_STEPS = 1_000  # of the loop in which a law and its file are compared
 GATE_TOLERANCE = 1e-9  # largest difference of an MV or a state, relative to its largest value
@@ -82,6 +83,7 @@ def export(
         inputs=inputs,
         provenance=dict(provenance),
         evidence={},
+        operate=law.operate,
     )
     with draft_of(path) as draft:
         draft.write_bytes(file_bytes(model.SerializeToString(), manifest))
@@ -169,6 +171,8 @@ def _visited(
     signals, rng = law.signals, np.random.default_rng(0)
     courses = {"sp": _course(signals.sp, rng, 1 / 40), "pv": _course(signals.pv, rng), "dv": _course(signals.dv, rng)}
     applied, state = np.array([s.middle for s in signals.mv]), np.zeros(law.n_state)
+    if law.operate:
+        courses |= {"operate": _operated(Operate(law.operate), rng), "fresh": _freshness(len(signals.pv), rng)}
     given, answers = [], list[Array]()
     show = progress.steps("the exported file beside the law, step by step", steps)
     for k in range(steps):
@@ -188,7 +192,7 @@ def _visited(
 
 def _of_law(law: ControlLaw, given: Mapping[str, Array]) -> Iterator[Array]:
     """The law's answers (steps, m) to what the controller was given: side by side, then one by one."""
-    inputs = [torch.from_numpy(given[name]) for name in INPUTS]
+    inputs = [torch.from_numpy(given[name]) for name in INPUTS if name in given]
     n = len(inputs[0])
     for size in (STEPS_TOGETHER, 0):
         rows = [slice(k, k + size) for k in range(0, n, size)] if size else range(n)
@@ -246,6 +250,35 @@ def _course(signals: Sequence[Signal], rng: np.random.Generator, jumps: float | 
         return np.asarray(low + span * at)
 
     return step
+
+
+OPERATED = 1 / 25  # probability a step that an operator changes something
+USED = 0.85  # of switches that are on
+STALE = 0.1  # of readings that are not fresh
+
+
+def _operated(operate: Operate, rng: np.random.Generator) -> Callable[[], Array]:
+    """The defaults, and by and by other values within their engineered ranges: as operators change them."""
+    at = operate.default.copy()
+
+    def step() -> Array:
+        nonlocal at
+        if rng.uniform() < OPERATED:
+            at = np.array([rng.uniform(e.low, e.high) for e in operate.entries])
+            for i, e in enumerate(operate.entries):
+                if e.what in SWITCHES:
+                    at[i] = float(rng.uniform() < USED) * e.high
+                elif e.what == "rank":
+                    at[i] = round(at[i])
+                elif e.what == "high":  # stands behind its low end
+                    at[i - 1], at[i] = sorted(at[i - 1 : i + 1])
+        return at
+
+    return step
+
+
+def _freshness(n: int, rng: np.random.Generator) -> Callable[[], Array]:
+    return lambda: (rng.uniform(size=n) > STALE).astype(np.float64)
 
 
 def _check_shapes(law: ControlLaw) -> None:

@@ -128,8 +128,8 @@ OUTPUTS = ("mv", "state_next", "info")
 def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     """The graph of one step as the law is written, and the inputs that it uses, in the order of the contract.
 
-    Inputs ``sp, pv, dv, mv_applied, state`` and outputs ``mv, state_next, info``, all float64 of
-    rank 1; an input that the law does not use and an output of size zero are left out.
+    Inputs ``sp, pv, dv, mv_applied, state``, of a law that reads them ``operate, fresh``, and outputs ``mv, state_next,
+    info``, all float64 of rank 1; an input that the law does not use and an output of size zero are left out.
 
     Raises ExportError where the law cannot be such a graph.
     """
@@ -152,9 +152,13 @@ def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
 
 
 def example_inputs(law: ControlLaw) -> tuple[torch.Tensor, ...]:
-    """``sp, pv, dv, mv_applied, state`` of the law's sizes, all zero."""
+    """``sp, pv, dv, mv_applied, state`` of the law's sizes, all zero; ``operate`` by its defaults, all ``fresh``."""
     sizes = (*(len(getattr(law.signals, name)) for name in ("sp", "pv", "dv", "mv")), law.n_state)
-    return tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
+    zeros = tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
+    if not law.operate:
+        return zeros
+    defaults = torch.tensor([entry.default for entry in law.operate], dtype=torch.float64)
+    return (*zeros, defaults, torch.ones(sizes[1], dtype=torch.float64))
 
 
 @dataclass(frozen=True)
@@ -255,7 +259,7 @@ def _name_ends(model: ir.Model, sizes: tuple[int, ...]) -> tuple[str, ...]:
     """
     graph = model.graph
     passes.OutputFixPass()(model)
-    for value, name in zip((*graph.inputs, *graph.outputs), (*INPUTS, *OUTPUTS), strict=True):
+    for value, name in zip((*graph.inputs, *graph.outputs), (*INPUTS[: len(sizes)], *OUTPUTS), strict=True):
         value.name = name
     for value, size in zip(list(graph.inputs), sizes, strict=True):
         if size == 0:
@@ -266,7 +270,7 @@ def _name_ends(model: ir.Model, sizes: tuple[int, ...]) -> tuple[str, ...]:
     for value in list(graph.outputs):
         if value.shape is not None and value.shape.numpy() == (0,):
             graph.outputs.remove(value)
-    return tuple(name for name, size in zip(INPUTS, sizes, strict=True) if size)
+    return tuple(name for name, size in zip(INPUTS, sizes, strict=False) if size)
 
 
 def _simplify(model: ir.Model) -> None:

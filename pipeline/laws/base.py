@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
+from loopwright.serving.manifest import OperateEntry
 
 M = TypeVar("M", bound=Model)
 Stepped: TypeAlias = tuple[Tensor, Tensor, Tensor]
@@ -113,6 +114,7 @@ class ControlLaw(nn.Module, ABC):
     parts: ClassVar[Mapping[str, str]] = {}  # what `design` needs of the model set: part name -> what it must be
     n_state: int
     info: tuple[str, ...]
+    operate: tuple[OperateEntry, ...] = ()  # of a law with two more inputs: what operators change, and fresh readings
     low: Tensor  # (n_mv,)
     high: Tensor  # (n_mv,)
     rate: Tensor | None  # (n_mv,) largest change a sample, infinite without a limit; None where no MV has one

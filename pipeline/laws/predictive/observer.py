@@ -85,6 +85,7 @@ class Observer(nn.Module):
     place: Tensor  # (n_y, n_a n_a) from a boost to what it adds to the covariance
     first: Tensor  # (n_a, n_a) covariance without a past
     q: Tensor  # (n_a, n_a)
+    q_load: Tensor  # (n_a, n_a) of it, that of the loads
     r: Tensor  # (n_y,)
     f: Tensor  # (n_a, n_a) slope of [x, d] without tanh units
     f_t: Tensor
@@ -118,6 +119,7 @@ class Observer(nn.Module):
         r = torch.clamp(model.noise, min=NOISE_FLOOR) ** 2
         q = torch.zeros(n_a, dtype=torch.float64)
         q[: self.n_y], q[n_x:] = noises.outputs * r, (noises.loads * r) @ loads.share
+        q_load = torch.cat([torch.zeros(n_x, dtype=torch.float64), q[n_x:]])
         place = torch.zeros(self.n_y, n_a, n_a, dtype=torch.float64)
         for i in range(loads.count):
             since = torch.cat(
@@ -131,7 +133,13 @@ class Observer(nn.Module):
         first[self.n_y : n_x, self.n_y : n_x] = model.rest_cov[self.n_y :, self.n_y :]
         first[:n_x, :n_x] += (by_y * r) @ by_y.T
         first[n_x:, n_x:] = FIRST_LOAD**2 * torch.eye(loads.count, dtype=torch.float64)
-        for name, values in {"q": torch.diag(q), "r": r, "place": place.flatten(1), "first": first}.items():
+        for name, values in {
+            "q": torch.diag(q),
+            "q_load": torch.diag(q_load),
+            "r": r,
+            "place": place.flatten(1),
+            "first": first,
+        }.items():
             self.register_buffer(name, values.contiguous())
         self.register_buffer("diagonal", torch.arange(self.n_y) * (n_a + 1))
         hold_numbers(
@@ -143,25 +151,38 @@ class Observer(nn.Module):
             swings=SWING_WEIGHT,
         )
 
-    def forward(self, y: Tensor, v: Tensor, past: StateEstimate) -> tuple[StateEstimate, Tensor]:
+    def forward(
+        self, y: Tensor, v: Tensor, past: StateEstimate, fresh: Tensor | None = None, load_share: Tensor | None = None
+    ) -> tuple[StateEstimate, Tensor]:
         """The estimate after the measurement, and the boost b (..., 1, n_y), 0 to 1.
 
-        y (..., 1, n_y) and v (..., 1, n_v) scaled: what is measured now, and what acted over the last period.
+        y (..., 1, n_y) and v (..., 1, n_v) scaled: what is measured now, and what acted over the last period. ``fresh``
+        (..., 1, n_y) is 0 for an output that is not measured now, and 1 else: its correction is left out, and nothing
+        is learnt of its innovations. ``load_share`` (..., 1, 1) multiplies the variance of the loads' changes.
         """
         mean, covariance = self.predicted(v, past)
+        if load_share is not None:
+            covariance = covariance + (load_share - 1.0) * self.q_load
         variance = covariance.flatten(-2).index_select(-1, self.diagonal).unsqueeze(-2)
         sd = torch.sqrt(variance + self.r)
         innovation = torch.clamp((y - mean[..., : self.n_y]) / sd, -OUTLIER, OUTLIER)
-        drift = past.drift + self.forgetting * (innovation - past.drift)
+        learning = self.forgetting if fresh is None else self.forgetting * fresh
+        drift = past.drift + learning * (innovation - past.drift)
         signed = innovation * innovation.abs()
-        squares = past.squares + self.calming * (torch.cat([signed.abs(), signed], dim=-1) - past.squares)
+        calming = self.calming if fresh is None else self.calming * torch.cat([fresh, fresh], dim=-1)
+        squares = past.squares + calming * (torch.cat([signed.abs(), signed], dim=-1) - past.squares)
         both = squares[..., : self.n_y] - squares[..., self.n_y :].abs()
         calm = torch.clamp(1.0 + self.swings * (both - 1.0), min=1.0)
         boost = torch.clamp(self.rise * drift * drift / calm - 1.0, 0.0, FULL)
-        covariance = covariance + (boost @ self.place).reshape(covariance.shape)
+        if fresh is not None:
+            boost = boost * fresh
+        grown = boost if load_share is None else load_share * boost
+        covariance = covariance + (grown @ self.place).reshape(covariance.shape)
         for o in range(self.n_y):
             row = covariance[..., o : o + 1, :]
             gain = row / (row[..., o : o + 1] + self.r[o : o + 1])
+            if fresh is not None:
+                gain = gain * fresh[..., o : o + 1]
             mean = mean + gain * (y[..., o : o + 1] - mean[..., o : o + 1])
             covariance = covariance - gain.reshape(*gain.shape[:-2], self.n_a, 1) * row
         return StateEstimate(mean, covariance, drift, squares), self.fall * boost

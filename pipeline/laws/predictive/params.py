@@ -39,6 +39,8 @@ class PredictiveParams:
     for each MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
     none; None: no limits. A set point beyond a limit counts as one at the limit. ``preview`` of the set points:
     ``held``, as they are now; ``ramp``, their last slope goes on, as in a recipe of ramps; steps to come are not known.
+    ``operate``: the law reads what operators change while it runs, and which readings are fresh; ``cv_low`` and
+    ``cv_high`` are then the ranges' defaults.
     """
 
     speed: float = 1.0
@@ -61,6 +63,7 @@ class PredictiveParams:
     cv_low: Limits = None
     cv_high: Limits = None
     preview: Literal["held", "ramp"] = "held"
+    operate: bool = False
 
     def __post_init__(self) -> None:
         for name in ("speed", "caution", "jumps", "move_weight", "eps", "q_x", "q_d"):

@@ -15,6 +15,7 @@ from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balance
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of, product
 from loopwright.pipeline.laws.predictive.horizon_check import AnswerTimes, horizon_for, mvs_of, refuse_unstable
 from loopwright.pipeline.laws.predictive.observer import Noises, Observer, StateEstimate, load_variance
+from loopwright.pipeline.laws.predictive.operating import OperateScales, Operation, entries_of
 from loopwright.pipeline.laws.predictive.params import (
     PredictiveParams,
     check_sizes,
@@ -50,7 +51,8 @@ class Predictive(ControlLaw):
     of reach ends at the nearest output. The last plan, one sample on, is where the next one begins. The filter reads
     the MV that really acted: that is the anti-windup. Without a past it starts at the rest that fits the process
     variables and the applied MV, under the loads that hold it there: on set point it asks for that MV. The set points r
-    stay as they are, or go on with their last slope. CVs may have soft limits, whose cost is added.
+    stay as they are, or go on with their last slope. CVs may have soft limits, whose cost is added. With ``operate``
+    operators give ranges, take signals out, and set priorities, resting values and costs while it runs.
 
     ``Observer``, ``LinearHorizon`` and ``NetworkHorizon``, ``Planner``, ``SetPointCourse`` and ``SoftLimits`` hold the
     formulas and their sources.
@@ -66,6 +68,9 @@ class Predictive(ControlLaw):
     tried: tuple[TriedNumbers, ...] = ()  # of a search, the numbers that it started from first
     calmer: tuple[Identified, PredictiveParams] | None = None  # of a search: model and numbers of last resort
     remarks: tuple[str, ...] = ()  # on a horizon that is short for the model
+    operation: Operation | None  # of a law that reads ``operate`` and ``fresh``
+    operate_default: Tensor  # (n_operate,)
+    variances: Tensor  # (n_o,) where the outputs' variances stand in the state's covariance
     shift: Tensor  # (m, m) of a plan to the next sample
     upper: Tensor  # where the flat covariance's upper half stands
     whole: Tensor  # (n_a n_a,) the flat covariance's entries in its upper half
@@ -97,11 +102,17 @@ class Predictive(ControlLaw):
         self.q_d = load_variance(model) if params.q_d is None else torch.full((model.n_y,), params.q_d).double()
         self.observer = Observer(model, loads, Noises(params.q_x, self.q_d / params.caution**2, params.jumps))
         rate = None if self.rate is None else self.rate / half
-        run = horizon_of(model, loads, self.moves, mv_of, n_cv)
-        bounds = self._bounds(model, params)
+        # With `operate` further PVs that the model has as outputs have ranges, too.
+        n_o = model.n_y if params.operate else n_cv
+        run = horizon_of(model, loads, self.moves, mv_of, n_o)
+        bounds = None if params.operate else self._bounds(model, params)
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
+        cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
         self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls)
-        self.wanted = self._set_points(model, bounds, ramp=params.preview == "ramp")
+        self.wanted = self._set_points(model, bounds, n_o, ramp=params.preview == "ramp")
+        self.operation = None
+        if params.operate:
+            self._build_operation(model, params, n_o, max(weights), middle, half)
         at_mvs = loads.into_v[:n_mv].diagonal() * model.v_scale[:n_mv] if loads.at_mvs else model.y_scale[:n_cv]
         self.register_buffer("load_scale", at_mvs.clone())
         self.register_buffer("largest", balanced(model, loads, 2 * half / model.v_scale[:n_mv], horizon))
@@ -120,8 +131,10 @@ class Predictive(ControlLaw):
         low, high = ((torch.from_numpy(end) - model.y_center[:n_cv]) / model.y_scale[:n_cv] for end in found)
         return low, high
 
-    def _set_points(self, model: Identified, bounds: tuple[Tensor, Tensor] | None, *, ramp: bool) -> SetPointCourse:
-        """The course of the set points over the horizon, within ``bounds``; a ramp ends at the signals' ranges."""
+    def _set_points(
+        self, model: Identified, bounds: tuple[Tensor, Tensor] | None, n_o: int, *, ramp: bool
+    ) -> SetPointCourse:
+        """The course of ``n_o`` set points over the horizon, within ``bounds``; a ramp ends at the signals' ranges."""
         n_cv = len(self.signals.sp)
         if ramp:
             ends = torch.tensor([(s.low, s.high) for s in self.signals.sp], dtype=torch.float64)
@@ -129,7 +142,21 @@ class Predictive(ControlLaw):
             if bounds is not None:
                 low, high = (torch.minimum(torch.maximum(end, bounds[0]), bounds[1]) for end in (low, high))
             bounds = low, high
-        return SetPointCourse(self.moves.horizon, n_cv, bounds, ramp=ramp)
+        return SetPointCourse(self.moves.horizon, n_o, bounds, ramp=ramp)
+
+    def _build_operation(
+        self, model: Identified, params: PredictiveParams, n_o: int, most_weight: float, middle: Tensor, half: Tensor
+    ) -> None:
+        """The entries of ``operate``, their defaults, and the way from them to a plan."""
+        low, high = (getattr(params, end) or (None,) * len(self.signals.sp) for end in ("cv_low", "cv_high"))
+        limits_of(self.signals, params)  # raises
+        self.operate = entries_of(self.signals, n_o, low, high)
+        scales = OperateScales(model.y_center[:n_o], model.y_scale[:n_o], middle, half)
+        self.operation = Operation(self.operate, scales, self.moves, most_weight)
+        default = torch.tensor([entry.default for entry in self.operate], dtype=torch.float64)
+        self.register_buffer("operate_default", default)
+        rows, columns = torch.triu_indices(self.observer.n_a, self.observer.n_a)
+        self.register_buffer("variances", torch.nonzero((rows == columns) & (rows < n_o)).flatten())
 
     @torch.no_grad()
     def _build_ends(self, model: Identified, loads: Loads, n_cv: int, middle: Tensor, half: Tensor) -> None:
@@ -208,7 +235,7 @@ class Predictive(ControlLaw):
 
         Its set points step over the record's range, so it knows no soft limits and no recipe.
         """
-        horizon, plain = self.moves.horizon, replace(params, cv_low=None, cv_high=None, preview="held")
+        horizon, plain = self.moves.horizon, replace(params, cv_low=None, cv_high=None, preview="held", operate=False)
 
         def law_of(n: Mapping[str, float], damping: float | None, given: PredictiveParams = plain) -> Any:
             numbers: dict[str, Any] = {**n, "horizon": int(n["horizon"]), "damping": damping}
@@ -255,28 +282,56 @@ class Predictive(ControlLaw):
         weights_of(signals, params)
         limits_of(signals, params)
 
-    def forward(self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor) -> Stepped:
-        """One step; shapes as in ControlLaw."""
+    def forward(
+        self,
+        sp: Tensor,
+        pv: Tensor,
+        dv: Tensor,
+        mv_applied: Tensor,
+        state: Tensor,
+        operate: Tensor | None = None,
+        fresh: Tensor | None = None,
+    ) -> Stepped:
+        """One step; shapes as in ControlLaw. ``operate`` (..., n_operate), ``fresh`` (..., n_pv); None: by default."""
         now = self.inputs(torch.cat([sp, pv, dv, mv_applied], dim=-1).unsqueeze(-2))
         parts = torch.split(state.unsqueeze(-2), list(self.kept.values()), dim=-1)
         kept = dict(zip(self.kept, parts, strict=True))
-        mean, boost, estimate, plan = self._estimated(now, kept)
+        operated, seen, n_y = None, None, now["y"].shape[-1]
+        applied = torch.clamp(now["z"], -1.0, 1.0)
+        if self.operation is not None:
+            given = self.operate_default.expand(*sp.shape[:-1], -1) if operate is None else operate
+            seen = torch.ones_like(now["y"]) if fresh is None else fresh[..., :n_y].unsqueeze(-2)
+            share = self.operation.load_share(given.unsqueeze(-2))
+            mean, boost, estimate, plan = self._estimated(now, kept, seen, share)
+            variance = estimate[..., mean.shape[-1] :].index_select(-1, self.variances)
+            operated = self.operation(given.unsqueeze(-2), applied, torch.sqrt(torch.clamp(variance, min=0.0)))
+        else:
+            mean, boost, estimate, plan = self._estimated(now, kept)
         measured = now["v"][..., now["z"].shape[-1] :]
         n_cv = sp.shape[-1]
         levels = [self._level(measured, kept)] if "level" in kept else []
         start = torch.cat([mean, *(levels or [measured])], dim=-1)
-        applied = torch.clamp(now["z"], -1.0, 1.0)
         past = [torch.where(kept["started"] > 0, kept[n], now["sp"]) for n in ("sp", "sp_before") if n in kept]
-        plan, ahead = self.planner(start, self.wanted(now["sp"], past), applied, plan)
+        wanted = self.wanted(self._of_outputs(now["sp"]), [self._of_outputs(p) for p in past])
+        plan, ahead = self.planner(start, wanted, applied, plan, operated)
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)
+        if operated is not None:
+            used, most = operated.mv_use.squeeze(-2), operated.mv_move.squeeze(-2)
+            mv = torch.minimum(torch.maximum(mv, mv_applied - most), mv_applied + most)
+            mv = used * mv + (1 - used) * mv_applied
         info = [
             self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],
-            self.y_center + self.y_scale * ahead,
+            self.y_center + self.y_scale * ahead[..., :n_cv],
             boost[..., :n_cv],
         ]
         recipe = [now["sp"], past[0]] if past else []
         state_next = torch.cat([now["one"], estimate, plan, measured, *levels, *recipe], dim=-1).squeeze(-2)
         return self.limited(mv, mv_applied), state_next, torch.cat(info, dim=-1).squeeze(-2)
+
+    def _of_outputs(self, sp: Tensor) -> Tensor:
+        """Set points (..., 1, n_o), zeros for outputs that have a range alone."""
+        others = self.wanted.n_cv - sp.shape[-1]
+        return sp if not others else torch.cat([sp, *[torch.zeros_like(sp[..., :1])] * others], dim=-1)
 
     def _level(self, measured: Tensor, kept: Named) -> Tensor:
         """The level (..., 1, n_dv) of the measured disturbances, scaled; without a past, what is measured."""
@@ -328,14 +383,20 @@ class Predictive(ControlLaw):
         moved = (self.observer.ahead(start, v) - start)[..., : self.observer.n_x]
         return (moved * moved).sum(-1, keepdim=True)
 
-    def _estimated(self, now: Named, kept: Named) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _estimated(
+        self, now: Named, kept: Named, fresh: Tensor | None = None, load_share: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """[x, d], the boost, what of the estimate goes to the next state, and the plan to begin at."""
         n_a, n_mv = self.observer.n_a, now["z"].shape[-1]
         packed = kept["covariance"]
         square = packed.index_select(-1, self.whole).reshape(*packed.shape[:-2], n_a, n_a)
         acted = torch.cat([now["v"][..., :n_mv], *(kept[n] for n in ("dv",) if n in kept)], dim=-1)
         seen, boost = self.observer(
-            now["y"], acted, StateEstimate(kept["mean"], square, kept["drift"], kept["squares"])
+            now["y"],
+            acted,
+            StateEstimate(kept["mean"], square, kept["drift"], kept["squares"]),
+            fresh,
+            load_share,
         )
         flat = seen.covariance.flatten(-2).index_select(-1, self.upper).unsqueeze(-2)
         known = torch.cat([seen.mean, flat, seen.drift, seen.squares, kept["plan"] @ self.shift], dim=-1)

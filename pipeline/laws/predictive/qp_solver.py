@@ -31,7 +31,7 @@ class SetPointCourse(nn.Module):
 
     def __init__(self, horizon: int, n_cv: int, bounds: tuple[Tensor, Tensor] | None, *, ramp: bool) -> None:
         super().__init__()
-        self.horizon, self.ramp = horizon, ramp
+        self.horizon, self.n_cv, self.ramp = horizon, n_cv, ramp
         low, high = (None, None) if bounds is None else (end.repeat(horizon) for end in bounds)
         samples = torch.arange(1, horizon + 1, dtype=torch.float64).repeat_interleave(n_cv) if ramp else None
         for name, values in {"low": low, "high": high, "samples": samples}.items():
@@ -67,6 +67,36 @@ class LimitCost(NamedTuple):
     slope: Tensor  # (..., 1, N n_cv)
 
 
+class Operated(NamedTuple):
+    """What operators ask of a plan, scaled; of outputs (..., 1, N n_o), of a plan's moves (..., 1, m)."""
+
+    track: Tensor  # 1 where a set point is followed, 0 elsewhere
+    use: Tensor  # 1 where a CV is in use
+    low: Tensor  # of the outputs' ranges
+    high: Tensor
+    low_inside: Tensor  # where the price of leaving it begins
+    high_inside: Tensor
+    price: Tensor  # of what lies beyond a range; 0 out of use
+    y_cost: Tensor  # slope of the cost over the outputs
+    z_low: Tensor  # of the moves
+    z_high: Tensor
+    rate: Tensor  # largest difference from the move before
+    rest: Tensor  # of the moves
+    rest_weight: Tensor  # curvature of the cost of being away from it
+    z_cost: Tensor  # slope of the cost over the moves
+    stiffness: Tensor  # (..., 1, 1) of the moves' cost over the designed one
+    mv_use: Tensor  # (..., 1, n_mv)
+    mv_move: Tensor  # (..., 1, n_mv) [mv] a period
+
+
+def limit_cost(y: Tensor, low: Tensor, high: Tensor, price: Tensor, soft: Tensor, eps_squared: Tensor) -> LimitCost:
+    """The push on outputs y (..., 1, N n_cv) that lie outside low..high, as ``SoftLimits`` says; all scaled."""
+    beyond = y - torch.minimum(torch.maximum(y, low), high)
+    size = beyond.abs()
+    weight = price * size / ((size + soft) * torch.sqrt(size * size + eps_squared))
+    return LimitCost(weight, weight * beyond)
+
+
 class SoftLimits(nn.Module):
     """The cost of outputs beyond their limits: sum p(b) over all samples, with the slope of p.
 
@@ -95,10 +125,7 @@ class SoftLimits(nn.Module):
 
     def forward(self, y: Tensor) -> LimitCost:
         """The push on outputs y (..., 1, N n_cv), scaled."""
-        beyond = y - torch.minimum(torch.maximum(y, self.low), self.high)
-        size = beyond.abs()
-        weight = self.price * size / ((size + self.soft) * torch.sqrt(size * size + self.eps_squared))
-        return LimitCost(weight, weight * beyond)
+        return limit_cost(y, self.low, self.high, self.price, self.soft, self.eps_squared)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +172,8 @@ class Planner(nn.Module):
     eye: Tensor  # (m, m)
     stiff: Tensor  # (m, m) ones, and 1 + kappa on the diagonal
     damping: Tensor  # (1,) kappa
+    soft: Tensor  # (1,) of the price of a range
+    soft_squared: Tensor  # (1,)
 
     def __init__(
         self,
@@ -174,13 +203,19 @@ class Planner(nn.Module):
         for name, values in buffers.items():
             self.register_buffer(name, values)
         hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2, damping=cost.damping)
+        hold_numbers(self, soft=SOFT, soft_squared=EPS**2)
 
-    def forward(self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, operated: Operated | None = None
+    ) -> tuple[Tensor, Tensor]:
         """The plan (..., 1, m), and the outputs (..., 1, n_cv) that it gives at the next sample.
 
         From ``start`` (..., 1, n_x + n_y + n_dv), with the set points ``wanted`` (..., 1, N n_cv) over the horizon,
-        the ``applied`` MV (..., 1, n_mv) within -1..1, beginning at ``plan``; all scaled.
+        the ``applied`` MV (..., 1, n_mv) within -1..1, beginning at ``plan``; all scaled. With ``operated`` as
+        operators have it, see ``_operated``.
         """
+        if operated is not None:
+            return self._operated(start, wanted, applied, plan, operated)
         n_cv = self.n_cv
         held, at = applied @ self.applied, applied @ self.first
         for _ in range(self.passes):
@@ -199,8 +234,49 @@ class Planner(nn.Module):
         ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
         return plan, ahead
 
-    def descended(self, curvature: Tensor, pull: Tensor, plan: Tensor, at: Tensor) -> Tensor:
+    def _operated(
+        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, by: Operated
+    ) -> tuple[Tensor, Tensor]:
+        """The plan that is best with ranges, priorities, resting values and costs, within the operators' bounds.
+
+            sum_k sum_o  t_o q_o sqrt((y_o - r_o)^2 + eps^2) + p_o(b_o) + c_o y_o
+            + mu s sum_j |z_j - z_{j-1}|^2 + sum_j w_j (z_j - rest)^2/2 + c_j z_j
+
+        t is 1 for a set point that is followed, b_o what lies beyond the range of output o, p_o the cost of
+        ``SoftLimits`` with its price by rank, s the stiffness. A set point outside its range counts as the end of it.
+        """
+        n_cv, stiff = self.n_cv, by.stiffness * self.moved + by.rest_weight * self.eye
+        at = applied @ self.first
+        held = by.stiffness * (applied @ self.applied) + by.rest_weight * by.rest - by.z_cost
+        wanted, weights = torch.minimum(torch.maximum(wanted, by.low), by.high), self.weights * by.track
+        for _ in range(self.passes):
+            run = self.horizon(start, plan)
+            error = run.y - wanted
+            weight = weights / torch.sqrt(error * error + self.eps_squared)
+            push = limit_cost(run.y, by.low_inside, by.high_inside, by.price, self.soft, self.soft_squared)
+            both = weight + push.weight
+            curvature = product(run.slopes * both, run.slopes_t, stiff)
+            back = both * (plan @ run.slopes) - weight * error - push.slope - by.y_cost
+            pull = product(back, run.slopes_t, held)
+            before = plan
+            diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
+            pull = pull + self.damping * diagonal * plan
+            plan = self.descended(curvature * self.stiff, pull, plan, at, (by.z_low, by.z_high, by.rate))
+        ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
+        return plan, ahead
+
+    def descended(
+        self,
+        curvature: Tensor,
+        pull: Tensor,
+        plan: Tensor,
+        at: Tensor,
+        bounds: tuple[Tensor, Tensor, Tensor] | None = None,
+    ) -> Tensor:
         """The minimum of z'Hz/2 - pull z within the bounds, from ``plan``: H (..., m, m), the others (..., 1, m).
+
+        ``bounds`` are the least and largest value of each move and its largest difference from the one before; without
+        them all lie within -1..1, and differ by the rate.
 
         Coordinate p is z_p = (pull_p - sum_{q != p} H_pq z_q)/H_pp, cut to its bounds. Written for the whole row
         that is z G_p + c_p, where only column p of G_p is not the identity's.
@@ -212,12 +288,16 @@ class Planner(nn.Module):
         into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
         add = torch.split(c, 1, dim=-2)
         for _ in range(self.sweeps):
-            if self.rate is None:
+            if bounds is None and self.rate is None:
                 for p in range(m):
                     plan = hardtanh(product(plan, into[p], add[p]))
                 continue
             middle = product(plan, self.before, at)
-            low, high = (torch.clamp(end, -1.0, 1.0) for end in (middle - self.rate, middle + self.rate))
+            if bounds is None:
+                low, high = (torch.clamp(end, -1.0, 1.0) for end in (middle - self.rate, middle + self.rate))
+            else:
+                least, most, rate = bounds
+                low, high = (torch.minimum(torch.maximum(end, least), most) for end in (middle - rate, middle + rate))
             for p in range(m):
                 plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
         return plan

@@ -1,0 +1,178 @@
+"""What operators change of a running predictive law: ranges, uses, ranks, resting values, costs, speed, caution."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from loopwright.pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.predictive.horizon import Moves
+from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Operated
+from loopwright.pipeline.plants.simulator import Signals
+from loopwright.serving.manifest import Group, OperateEntry, Signal, What
+
+MOST_RANKS = 4  # ranks of ranges, 1 kept first
+RANK_RATIO = 4.0  # of the price of a range's violation over that of the next rank
+SLOWEST, FASTEST = 0.25, 4.0  # of the designed speed and caution
+LEAST_MOVE = 1e-4  # of an MV's range a period: less is `use` 0
+MOST_COST = 1e6  # of a cost per unit: only ratios count
+REST_WEIGHT = 1e-4  # of a squared half range away from a resting value, a sample: a set point hardly feels it
+COST_SLOPE = 0.01  # of the costs together, a sample and half range: below any price, and of weights a hundredth
+TINY_COST = 1e-12  # costs below it are none
+MARGIN_SDS = 2.0  # standard deviations of the estimated output by which a range without a set point is kept inside
+
+
+def entries_of(
+    signals: Signals, outputs: int, cv_low: Sequence[float | None], cv_high: Sequence[float | None]
+) -> tuple[OperateEntry, ...]:
+    """The entries of ``operate`` of a law whose first ``outputs`` PVs have ranges; those with set points stand first.
+
+    By default all is as without ``operate``: every signal in use, set points tracked, ranges from ``cv_low`` to
+    ``cv_high`` [pv], or as wide as the signals' where these are None or too few, no resting values, no costs.
+    """
+    found = []
+
+    def add(
+        group: Group, s: Signal | None, what: What, default: float, low: float, high: float, unit: str = ""
+    ) -> None:
+        found.append(OperateEntry(group, "" if s is None else s.name, what, unit, default, low, high))
+
+    for i, s in enumerate(signals.pv[:outputs]):
+        tracked = float(i < len(signals.sp))
+        add("cv", s, "use", 1.0, 0.0, 1.0)
+        add("cv", s, "track", tracked, 0.0, tracked)
+        low, high = (of[i] if i < len(of) else None for of in (cv_low, cv_high))
+        add("cv", s, "low", s.low if low is None else low, s.low, s.high, s.unit)
+        add("cv", s, "high", s.high if high is None else high, s.low, s.high, s.unit)
+        add("cv", s, "rank", 1.0, 1.0, float(MOST_RANKS))
+        add("cv", s, "cost", 0.0, -MOST_COST, MOST_COST, f"1/{s.unit}")
+    for s in signals.mv:
+        fastest = min(s.max_move or s.high - s.low, s.high - s.low)
+        add("mv", s, "use", 1.0, 0.0, 1.0)
+        add("mv", s, "low", s.low, s.low, s.high, s.unit)
+        add("mv", s, "high", s.high, s.low, s.high, s.unit)
+        add("mv", s, "max_move", fastest, min(LEAST_MOVE * (s.high - s.low), fastest), fastest, s.unit)
+        add("mv", s, "rest", s.middle, s.low, s.high, s.unit)
+        add("mv", s, "rest_use", 0.0, 0.0, 1.0)
+        add("mv", s, "cost", 0.0, -MOST_COST, MOST_COST, f"1/{s.unit}")
+    add("law", None, "speed", 1.0, SLOWEST, FASTEST)
+    add("law", None, "caution", 1.0, SLOWEST, FASTEST)
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class OperateScales:
+    """Scales of the law: outputs' centre and spread (n_o,) [pv], MVs' middle and half range (n_mv,) [mv]."""
+
+    y_center: Tensor
+    y_scale: Tensor
+    mv_middle: Tensor
+    mv_half: Tensor
+
+
+class Operation(nn.Module):
+    """From ``operate`` to the numbers of a plan over N samples.
+
+    The price of a range of rank r is rho 4^(R - r), rho the price of a soft limit and R the number of ranks: a range of
+    rank 1 is kept at the expense of all later ones. An MV out of use keeps the applied value over the whole plan, and
+    what it does is known to the model. Costs are scaled by their largest, so that their ratios
+    alone count, and are small beside errors and prices: they decide where neither does, as resting values do.
+    """
+
+    y_center: Tensor
+    y_scale: Tensor
+    mv_middle: Tensor
+    mv_half: Tensor
+    lengths: Tensor  # (m,) samples of each move up to the next
+    apart: Tensor  # (m,) samples from the move before
+    price: Tensor  # (1,)
+    growth: Tensor  # (1,) logarithm of the ratio
+    rest_weight: Tensor  # (1,)
+    slope: Tensor  # (1,)
+    margin: Tensor  # (1,)
+
+    def __init__(
+        self, entries: Sequence[OperateEntry], scales: OperateScales, moves: Moves, most_weight: float
+    ) -> None:
+        super().__init__()
+        self.moves, self.n_moves = moves, len(moves.starts)
+        groups: tuple[Group, ...] = ("cv", "mv")
+        whats = {g: list(dict.fromkeys(e.what for e in entries if e.group == g)) for g in groups}
+        self.of_cv, self.of_mv = whats["cv"], whats["mv"]
+        self.n_o, self.n_mv = len(scales.y_scale), len(scales.mv_half)
+        for name in ("y_center", "y_scale", "mv_middle", "mv_half"):
+            self.register_buffer(name, getattr(scales, name).clone())
+        held = torch.from_numpy(moves.profile.sum(axis=0)).repeat_interleave(self.n_mv)
+        self.register_buffer("lengths", held)
+        self.register_buffer("apart", torch.from_numpy(moves.lengths))
+        hold_numbers(
+            self,
+            price=PRICE * most_weight,
+            growth=math.log(RANK_RATIO),
+            rest_weight=REST_WEIGHT,
+            slope=COST_SLOPE,
+            margin=MARGIN_SDS,
+        )
+
+    def forward(self, operate: Tensor, applied: Tensor, sd: Tensor) -> Operated:
+        """``operate`` (..., 1, n) as the manifest lists it; ``applied`` (..., 1, n_mv) MVs within -1..1.
+
+        ``sd`` (..., 1, n_o), scaled, of the estimated outputs: a variable that follows no set point is kept
+        ``MARGIN_SDS`` of them inside its range, or noise would have it outside half of the time.
+        """
+        n_cv, n_mv = self.n_o * len(self.of_cv), self.n_mv * len(self.of_mv)
+        cv = self._columns(operate[..., :n_cv], self.of_cv)
+        mv = self._columns(operate[..., n_cv : n_cv + n_mv], self.of_mv)
+        speed = operate[..., n_cv + n_mv : n_cv + n_mv + 1]
+        use, out = mv["use"], 1 - mv["use"]
+        low, high = ((mv[end] - self.mv_middle) / self.mv_half for end in ("low", "high"))
+        # Only ratios of costs count: the largest, per scaled unit, becomes the slope.
+        y_cost, z_cost = cv["cost"] * cv["use"] * self.y_scale, mv["cost"] * use * self.mv_half
+        largest = torch.cat([y_cost, z_cost], dim=-1).abs().amax(dim=-1, keepdim=True)
+        by = self.slope / torch.clamp(largest, min=TINY_COST)
+        rank = self.price * torch.exp(self.growth * (MOST_RANKS - cv["rank"]))
+        ends = [(cv[end] - self.y_center) / self.y_scale for end in ("low", "high")]
+        margin = torch.minimum(self.margin * sd * (1 - cv["track"]), 0.5 * (ends[1] - ends[0]))
+        return Operated(
+            track=self._samples(cv["track"] * cv["use"]),
+            use=self._samples(cv["use"]),
+            low=self._samples(ends[0]),
+            high=self._samples(ends[1]),
+            low_inside=self._samples(ends[0] + margin),
+            high_inside=self._samples(ends[1] - margin),
+            price=self._samples(rank * cv["use"]),
+            y_cost=self._samples(by * y_cost),
+            z_low=self._each_move(use * low + out * applied),
+            z_high=self._each_move(use * high + out * applied),
+            rate=self._each_move(mv["max_move"] / self.mv_half) * self.apart,
+            rest=self._each_move((mv["rest"] - self.mv_middle) / self.mv_half),
+            rest_weight=self._each_move(self.rest_weight * mv["rest_use"]) * self.lengths,
+            z_cost=self._each_move(by * z_cost) * self.lengths,
+            stiffness=1 / (speed * speed),
+            mv_use=use,
+            mv_move=mv["max_move"],
+        )
+
+    @staticmethod
+    def load_share(operate: Tensor) -> Tensor:
+        """Variance (..., 1, 1) of the loads' changes over the designed one."""
+        caution = operate[..., -1:]
+        return 1 / (caution * caution)
+
+    @staticmethod
+    def _columns(block: Tensor, whats: Sequence[str]) -> dict[str, Tensor]:
+        """Each ``what`` (..., 1, signals) of a block that lists them signal by signal."""
+        n = len(whats)
+        return {what: block[..., i::n] for i, what in enumerate(whats)}
+
+    def _samples(self, values: Tensor) -> Tensor:
+        """A value of each output at every sample of the horizon."""
+        return values.repeat(*(1 for _ in values.shape[:-1]), self.moves.horizon)
+
+    def _each_move(self, values: Tensor) -> Tensor:
+        """A value of each MV at every move."""
+        return values.repeat(*(1 for _ in values.shape[:-1]), self.n_moves)

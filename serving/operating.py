@@ -1,0 +1,63 @@
+"""What operators may change of a running law: ranges, uses, ranks, resting values and costs, by one vector."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from loopwright.serving.errors import ContractError
+from loopwright.serving.manifest import SWITCHES, OperateEntry
+from loopwright.serving.ranges import numbers
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+class Operate:
+    """The entries of a law's ``operate``: defaults, values by name, and what is wrong with some."""
+
+    def __init__(self, entries: Sequence[OperateEntry]) -> None:
+        self.entries = tuple(entries)
+        self.places = {e.name: i for i, e in enumerate(self.entries)}
+        self.default: Array = np.array([e.default for e in self.entries])
+        self._low, self._high = (np.array([getattr(e, end) for e in self.entries]) for end in ("low", "high"))
+        self._switches = np.array([e.what in SWITCHES for e in self.entries], dtype=bool)
+        pairs = [(i, self.places[f"{e.signal}.high"]) for i, e in enumerate(self.entries) if e.what == "low"]
+        self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+    def with_values(self, values: Mapping[str, float], base: ArrayLike | None = None) -> Array:
+        """``base`` (the defaults) with some values by name; ContractError for an unknown name or a wrong value."""
+        found = np.array(self.default if base is None else base, dtype=np.float64)
+        for name, value in values.items():
+            if name not in self.places:
+                raise ContractError(f"operate has no entry {name!r}; it has {', '.join(self.places)}")
+            found[self.places[name]] = value
+        return self.checked(found)
+
+    def checked(self, values: ArrayLike) -> Array:
+        """``values`` as float64 (n,); ContractError with the name of the first that is wrong.
+
+        A value must be finite and within its engineered range, a switch 0 or 1, and a low end at most the high one.
+        """
+        try:
+            given = np.asarray(numbers(values), dtype=np.float64)
+        except TypeError as error:
+            raise ContractError(f"operate {error}; it needs {len(self.entries)} numbers") from error
+        if given.shape != self.default.shape:
+            raise ContractError(f"operate has the shape {given.shape}; it needs ({len(self.entries)},)")
+        good = (given >= self._low) & (given <= self._high) & (~self._switches | (given == 0) | (given == 1))
+        if not good.all():
+            i = int(np.argmin(good))
+            e = self.entries[i]
+            allowed = "0 or 1" if self._switches[i] else f"{e.low:g} to {e.high:g} {e.unit}".rstrip()
+            raise ContractError(f"operate: {e.name} is {given[i]:g}; allowed is {allowed}")
+        crossed = given[self._pairs[:, 0]] > given[self._pairs[:, 1]]
+        if crossed.any():
+            low, high = (int(k) for k in self._pairs[int(np.argmax(crossed))])
+            raise ContractError(
+                f"operate: {self.entries[low].name} is {given[low]:g}, above {self.entries[high].name} = "
+                f"{given[high]:g}; a low end must not be above the high one"
+            )
+        return given
