@@ -304,7 +304,8 @@ class Predictive(ControlLaw):
             share = self.operation.load_share(given.unsqueeze(-2))
             mean, boost, estimate, plan = self._estimated(now, kept, seen, share)
             variance = estimate[..., mean.shape[-1] :].index_select(-1, self.variances)
-            operated = self.operation(given.unsqueeze(-2), applied, torch.sqrt(torch.clamp(variance, min=0.0)))
+            stands = applied.repeat(*(1 for _ in applied.shape[:-1]), len(self.moves.starts))
+            operated = self.operation(given.unsqueeze(-2), stands, torch.sqrt(torch.clamp(variance, min=0.0)))
         else:
             mean, boost, estimate, plan = self._estimated(now, kept)
         measured = now["v"][..., now["z"].shape[-1] :]
@@ -316,9 +317,8 @@ class Predictive(ControlLaw):
         plan, ahead = self.planner(start, wanted, applied, plan, operated)
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)
         if operated is not None:
-            used, most = operated.mv_use.squeeze(-2), operated.mv_move.squeeze(-2)
+            most = operated.mv_move.squeeze(-2)
             mv = torch.minimum(torch.maximum(mv, mv_applied - most), mv_applied + most)
-            mv = used * mv + (1 - used) * mv_applied
         info = [
             self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],
             self.y_center + self.y_scale * ahead[..., :n_cv],

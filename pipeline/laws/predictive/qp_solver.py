@@ -54,6 +54,8 @@ class SetPointCourse(nn.Module):
         return values.repeat(*(1 for _ in values.shape[:-1]), self.horizon)
 
 
+LEAST_HALF = 1e-9  # of half an MV's range: a narrower one is a point
+
 # --------------------------------------------------------------------------------------------------------- soft limits
 PRICE = 30.0  # of a scaled unit beyond a limit, in units of the largest weight of an error
 EPS = 0.03  # scaled: what lies beyond a limit by less counts by its square
@@ -71,22 +73,22 @@ class Operated(NamedTuple):
     """What operators ask of a plan, scaled; of outputs (..., 1, N n_o), of a plan's moves (..., 1, m)."""
 
     track: Tensor  # 1 where a set point is followed, 0 elsewhere
-    use: Tensor  # 1 where a CV is in use
     low: Tensor  # of the outputs' ranges
     high: Tensor
     low_inside: Tensor  # where the price of leaving it begins
     high_inside: Tensor
     price: Tensor  # of what lies beyond a range; 0 out of use
     y_cost: Tensor  # slope of the cost over the outputs
+    stands: Tensor  # the applied MV at every move
     z_low: Tensor  # of the moves
     z_high: Tensor
-    rate: Tensor  # largest difference from the move before
+    rate: Tensor  # largest difference from the move before; 0 out of use
+    reach: Tensor  # largest difference from the applied MV: as far as the rate brings it until then; 0 out of use
     rest: Tensor  # of the moves
     rest_weight: Tensor  # curvature of the cost of being away from it
     z_cost: Tensor  # slope of the cost over the moves
     stiffness: Tensor  # (..., 1, 1) of the moves' cost over the designed one
-    mv_use: Tensor  # (..., 1, n_mv)
-    mv_move: Tensor  # (..., 1, n_mv) [mv] a period
+    mv_move: Tensor  # (..., 1, n_mv) [mv] a period; 0 of an MV out of use
 
 
 def limit_cost(y: Tensor, low: Tensor, high: Tensor, price: Tensor, soft: Tensor, eps_squared: Tensor) -> LimitCost:
@@ -172,6 +174,7 @@ class Planner(nn.Module):
     eye: Tensor  # (m, m)
     stiff: Tensor  # (m, m) ones, and 1 + kappa on the diagonal
     damping: Tensor  # (1,) kappa
+    apart: Tensor  # (m, m) ones, and 0 on the diagonal
     soft: Tensor  # (1,) of the price of a range
     soft_squared: Tensor  # (1,)
 
@@ -199,6 +202,7 @@ class Planner(nn.Module):
             "columns": eye.unsqueeze(-2).repeat(1, self.m, 1),
             "eye": eye,
             "stiff": 1.0 + cost.damping * eye,
+            "apart": 1.0 - eye,
         }
         for name, values in buffers.items():
             self.register_buffer(name, values)
@@ -249,6 +253,12 @@ class Planner(nn.Module):
         at = applied @ self.first
         held = by.stiffness * (applied @ self.applied) + by.rest_weight * by.rest - by.z_cost
         wanted, weights = torch.minimum(torch.maximum(wanted, by.low), by.high), self.weights * by.track
+        # What the operators allow, as far as the MV gets until then; of an MV out of use where it stands.
+        low, high = (
+            torch.minimum(torch.maximum(end, by.stands - by.reach), by.stands + by.reach)
+            for end in (by.z_low, by.z_high)
+        )
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
         for _ in range(self.passes):
             run = self.horizon(start, plan)
             error = run.y - wanted
@@ -261,9 +271,33 @@ class Planner(nn.Module):
             before = plan
             diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
             pull = pull + self.damping * diagonal * plan
-            plan = self.descended(curvature * self.stiff, pull, plan, at, (by.z_low, by.z_high, by.rate))
+            if self.rate is None:
+                plan = self._descended_within(curvature * self.stiff, pull, plan, middle, half)
+            else:
+                plan = self.descended(curvature * self.stiff, pull, plan, at, (low, high, by.rate))
         ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
         return plan, ahead
+
+    def _descended_within(self, curvature: Tensor, pull: Tensor, plan: Tensor, middle: Tensor, half: Tensor) -> Tensor:
+        """The minimum of z'Hz/2 - pull z for z = middle + half t, |t| <= 1, from ``plan``; bounds (..., 1, m).
+
+        In t the bounds are numbers, so that a coordinate takes two operators, as without operators' limits.
+        """
+        m = self.m
+        size = torch.clamp(half, min=LEAST_HALF)
+        diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
+        share = curvature / (diagonal * size)  # column p over what makes t_p of it
+        rows = (half * self.eye).sum(dim=-1, keepdim=True)  # half as a column
+        others = rows * share * self.apart
+        g = self.eye - (others + self.eye).unsqueeze(-3) * self.columns
+        c = self.eye * (pull / (diagonal * size) - middle @ share)
+        into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
+        add = torch.split(c, 1, dim=-2)
+        t = (plan - middle) / size
+        for _ in range(self.sweeps):
+            for p in range(m):
+                t = hardtanh(product(t, into[p], add[p]))
+        return middle + half * t
 
     def descended(
         self,
@@ -292,12 +326,18 @@ class Planner(nn.Module):
                 for p in range(m):
                     plan = hardtanh(product(plan, into[p], add[p]))
                 continue
-            middle = product(plan, self.before, at)
-            if bounds is None:
-                low, high = (torch.clamp(end, -1.0, 1.0) for end in (middle - self.rate, middle + self.rate))
-            else:
-                least, most, rate = bounds
-                low, high = (torch.minimum(torch.maximum(end, least), most) for end in (middle - rate, middle + rate))
+            low, high = self._ends(product(plan, self.before, at), bounds)
             for p in range(m):
                 plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
         return plan
+
+    def _ends(self, middle: Tensor, bounds: tuple[Tensor, Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
+        """The ends of each move, whose move before is at ``middle`` (..., 1, m); ``bounds`` as in ``descended``."""
+        if bounds is not None:
+            least, most, rate = bounds
+            return (
+                torch.minimum(torch.maximum(middle - rate, least), most),
+                torch.minimum(torch.maximum(middle + rate, least), most),
+            )
+        assert self.rate is not None  # without a rate the ends are numbers
+        return torch.clamp(middle - self.rate, -1.0, 1.0), torch.clamp(middle + self.rate, -1.0, 1.0)
