@@ -103,15 +103,15 @@ class Predictive(ControlLaw):
         self.observer = Observer(model, loads, Noises(params.q_x, self.q_d / params.caution**2, params.jumps))
         rate = None if self.rate is None else self.rate / half
         # With `operate` further PVs that the model has as outputs have ranges, too.
-        n_o = model.n_y if params.operate else n_cv
+        n_o = n_cv if params.operate is None else model.n_y
         run = horizon_of(model, loads, self.moves, mv_of, n_o)
-        bounds = None if params.operate else self._bounds(model, params)
+        bounds = self._bounds(model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
         self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls)
         self.wanted = self._set_points(model, bounds, n_o, ramp=params.preview == "ramp")
         self.operation = None
-        if params.operate:
+        if params.operate is not None:
             self._build_operation(model, params, n_o, max(weights), middle, half)
         at_mvs = loads.into_v[:n_mv].diagonal() * model.v_scale[:n_mv] if loads.at_mvs else model.y_scale[:n_cv]
         self.register_buffer("load_scale", at_mvs.clone())
@@ -150,7 +150,7 @@ class Predictive(ControlLaw):
         """The entries of ``operate``, their defaults, and the way from them to a plan."""
         low, high = (getattr(params, end) or (None,) * len(self.signals.sp) for end in ("cv_low", "cv_high"))
         limits_of(self.signals, params)  # raises
-        self.operate = entries_of(self.signals, n_o, low, high)
+        self.operate = entries_of(self.signals, n_o, low, high, params.operate or {})
         scales = OperateScales(model.y_center[:n_o], model.y_scale[:n_o], middle, half)
         self.operation = Operation(self.operate, scales, self.moves, most_weight)
         default = torch.tensor([entry.default for entry in self.operate], dtype=torch.float64)
@@ -235,7 +235,7 @@ class Predictive(ControlLaw):
 
         Its set points step over the record's range, so it knows no soft limits and no recipe.
         """
-        horizon, plain = self.moves.horizon, replace(params, cv_low=None, cv_high=None, preview="held", operate=False)
+        horizon, plain = self.moves.horizon, replace(params, cv_low=None, cv_high=None, preview="held", operate=None)
 
         def law_of(n: Mapping[str, float], damping: float | None, given: PredictiveParams = plain) -> Any:
             numbers: dict[str, Any] = {**n, "horizon": int(n["horizon"]), "damping": damping}
