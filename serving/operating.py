@@ -1,4 +1,4 @@
-"""What operators may change of a running law: ranges, uses, ranks, resting values and costs, by one vector."""
+"""The numbers that operators may change of a running law, checked: ranges, uses, ranks, resting values, costs."""
 
 from __future__ import annotations
 

@@ -277,3 +277,61 @@ def test_a_manifest_of_a_law_without_it_has_no_such_entry(tmp_path: Path) -> Non
 def test_a_default_that_no_operator_may_set_is_refused(defaults: dict[str, float]) -> None:
     with pytest.raises(LawError, match=next(iter(defaults)).replace(".", r"\.")):
         law_of(random_model(1), horizon=20, operate=defaults)
+
+
+# ------------------------------------------------------------------------- schemes that these numbers take the place of
+def loaded(
+    law: Predictive, plant: Identified, sp: np.ndarray, operate: np.ndarray, load: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Outputs and MVs of a loop from rest at zero, under a load (n, n_y) that nobody measures."""
+    wanted, given = torch.from_numpy(sp), torch.from_numpy(operate)
+    x, state, mv = (torch.zeros(k).double() for k in (plant.n_x, law.n_state, plant.n_mv))
+    ys, mvs = [], []
+    with torch.no_grad():
+        for push in load:
+            y = plant.measured(x)
+            mv, state, _ = law(wanted, y, NONE, mv, state, given)
+            ys.append(y.numpy())
+            mvs.append(mv.numpy())
+            x = plant(torch.cat([x, mv]))
+            x[: plant.n_y] += torch.from_numpy(push)
+    return np.array(ys), np.array(mvs)
+
+
+def test_averaging_level_control_lets_the_level_take_up_the_flow() -> None:
+    """A buffer tank: its level may be anywhere within a range, and its outflow is calm; on a set point it is not."""
+    tank = lags([[0.0]], [1.0])
+    tank.b.copy_(torch.tensor([[-0.1]]))
+    law = law_of(tank, operate={"y0.low": -2.0, "y0.high": 2.0})
+    operate = Operate(law.operate)
+    waves = 0.06 * np.sign(np.sin(2 * np.pi * np.arange(400) / 40))[:, None]
+    averaging = operate.with_values({"y0.track": 0})
+    y, mv = loaded(law, tank, np.zeros(1), averaging, waves)
+    held, moved = loaded(law, tank, np.zeros(1), operate.default, waves)
+    travel, tracked = (np.abs(np.diff(of, axis=0)).sum() for of in (mv, moved))
+    assert np.abs(y).max() <= 2.0
+    assert travel < 0.2 * tracked
+    assert np.abs(held[50:]).mean() < np.abs(y[50:]).mean()  # what it costs
+
+
+def test_valve_position_control_brings_the_fast_valve_back_to_its_middle() -> None:
+    """Two valves on one flow, the large one a tenth as strong a period: the small one works, and comes back."""
+    flow = lags([[1.0, 1.5]], [0.5])
+    law = law_of(flow, operate={"u0.rest": 0.0, "u0.rest_use": 1, "u1.max_move": 0.02})
+    y, mv = loaded(law, flow, np.array([0.9]), Operate(law.operate).default, np.zeros((300, 1)))
+    assert np.abs(y[30:, 0] - 0.9).max() < 0.01
+    assert mv[:10, 0].max() > 0.5  # at first
+    assert abs(mv[-1, 0]) < 0.02
+    assert mv[-1, 1] == pytest.approx(0.6, abs=0.02)
+
+
+def test_split_range_never_heats_and_cools_at_once() -> None:
+    """Both MVs cost something from their closed end on: the one that is not needed is shut."""
+    jacket = lags([[1.2, -0.8]], [0.9])
+    law = law_of(jacket, operate={"u0.low": 0.0, "u1.low": 0.0, "u0.cost": 1.0, "u1.cost": 1.0})
+    default = Operate(law.operate).default
+    for sp, open_one in ((0.6, 0), (-0.5, 1)):
+        y, mv = loaded(law, jacket, np.array([sp]), default, np.zeros((250, 1)))
+        assert y[-1, 0] == pytest.approx(sp, abs=0.01)
+        assert mv[-1, 1 - open_one] == pytest.approx(0.0, abs=0.01)
+        assert mv[-1, open_one] > 0.3

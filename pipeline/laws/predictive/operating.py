@@ -1,4 +1,4 @@
-"""What operators change of a running predictive law: ranges, uses, ranks, resting values, costs, speed, caution."""
+"""Operators' changes of a running predictive law: ranges, uses, ranks, resting values, costs, speed, caution."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import hold_numbers
 from loopwright.pipeline.laws.predictive.horizon import Moves
-from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Operated
+from loopwright.pipeline.laws.predictive.qp_solver import PRICE, OperatedPlan
 from loopwright.pipeline.models.memory import AffineMap, Named
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.errors import LoopwrightError
@@ -23,7 +23,7 @@ MOST_RANKS = 4  # ranks of ranges, 1 kept first; the last one is still dearer th
 USUAL_RANK = 3  # rank of a range of which nobody says one: its price is that of a soft limit, and those are solved fast
 RANK_RATIO = 10.0  # of a range's price over the next rank's: of 19 pairs of ranges at odds on random 3x3 plants,
 # with gains from .3 to 2, the higher rank kept 99 % with a ratio of 4 on 11, of 10 on 18, of 30 on all
-SLOWEST, FASTEST = 0.25, 4.0  # of the designed speed and caution
+LEAST_FACTOR, MOST_FACTOR = 0.25, 4.0  # of the designed speed and caution
 LEAST_MOVE = 1e-4  # of an MV's range a period: less is `use` 0
 MOST_COST = 1e6  # of a cost per unit: only ratios count
 REST_WEIGHT = 0.01  # of a squared half range away from a resting value, a sample: a set point feels nothing of it
@@ -70,8 +70,8 @@ def entries_of(
         add("mv", s, "rest", s.middle, s.low, s.high, s.unit)
         add("mv", s, "rest_use", 0.0, 0.0, 1.0)
         add("mv", s, "cost", 0.0, -MOST_COST, MOST_COST, f"1/{s.unit}")
-    add("law", None, "speed", 1.0, SLOWEST, FASTEST)
-    add("law", None, "caution", 1.0, SLOWEST, FASTEST)
+    add("law", None, "speed", 1.0, LEAST_FACTOR, MOST_FACTOR)
+    add("law", None, "caution", 1.0, LEAST_FACTOR, MOST_FACTOR)
     return _with_defaults(found, defaults)
 
 
@@ -152,7 +152,7 @@ class Operation(nn.Module):
 
         self.numbers = AffineMap({"operate": len(entries)}, formulas)
 
-    def forward(self, operate: Tensor, stands: Tensor, sd: Tensor) -> Operated:
+    def forward(self, operate: Tensor, stands: Tensor, sd: Tensor) -> OperatedPlan:
         """``operate`` (..., 1, n) as the manifest lists it; ``stands`` (..., 1, m), scaled: the applied MVs.
 
         ``sd`` (..., 1, n_o), scaled, of the estimated outputs: a variable that follows no set point is kept
@@ -163,7 +163,7 @@ class Operation(nn.Module):
         largest = torch.cat([p["y_each"], p["z_each"]], dim=-1).abs().amax(dim=-1, keepdim=True)
         by = self.slope / torch.clamp(largest, min=TINY_COST)
         margin = self._samples(torch.minimum(self.margin * sd * p["free"], p["width"]))
-        return Operated(
+        return OperatedPlan(
             track=p["track"] * p["use"],
             low=p["low"],
             high=p["high"],

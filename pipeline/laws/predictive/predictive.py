@@ -108,7 +108,7 @@ class Predictive(ControlLaw):
         bounds = self._bounds(model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
-        self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls)
+        self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls, valleys=n_mv > n_cv)
         self.wanted = self._set_points(model, bounds, n_o, ramp=params.preview == "ramp")
         self.operation = None
         if params.operate is not None:
