@@ -21,7 +21,6 @@ from loopwright.serving.words import first_line, named
 
 # ---------------------------------------------------------------------- a controller in a loop that reads more signals
 Array: TypeAlias = NDArray[np.float64]
-Operated: TypeAlias = tuple[Operate, Array]  # the entries of a law's operate, and their values (n_operate,)
 
 
 class AdaptedController(Controller):
@@ -197,7 +196,12 @@ class Successor:
         self.reason = ""  # why the last scan gave no MV
 
     def step(
-        self, sample: Sample, sp: Array, applied: Array, past: Collection[Sample] = (), operated: Operated | None = None
+        self,
+        sample: Sample,
+        sp: Array,
+        applied: Array,
+        past: Collection[Sample] = (),
+        operated: tuple[Operate, Array] | None = None,
     ) -> None:
         """One scan; ``past`` ends with the sample before it, ``operated`` is of the controller in charge."""
         if operated is not None:
@@ -267,15 +271,15 @@ class ActiveController:
             self.successor.bridging.missed()
         return readings
 
-    def set_operate(self, values: Mapping[str, float]) -> None:
-        """Change what operators may change, by name; LoopError for a wrong name or value, and nothing is changed."""
+    def operate_with(self, values: Mapping[str, float]) -> Array:
+        """``operate`` (n_operate,) with some values by name; LoopError for a wrong name or value, or a law without."""
         m = self.controller.manifest
         if "operate" not in m.inputs:
             raise LoopError(f"{m.law} has no operate: nothing of it can be changed while it runs but its set points")
         if not isinstance(values, Mapping):
             raise LoopError(f"operate is {shown(values)}; it needs numbers by name: {', '.join(self.operating.places)}")
         try:
-            self.operate = self.operating.with_values(values, self.operate)
+            return self.operating.with_values(values, self.operate)
         except ContractError as error:
             raise LoopError(first_line(error)) from error
 

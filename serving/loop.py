@@ -118,7 +118,7 @@ class ControlLoop:
         guards = default_guards if guards is None else guards
         self._active = ActiveController(controller, guards, bridge_s=bridge_s, critical=critical)
         if operate:
-            self._active.set_operate(operate)
+            self.set_operate(operate)
         self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
         self.endpoint = endpoint
         self.recover_after = recover_after
@@ -231,7 +231,11 @@ class ControlLoop:
         No transfer begins: the law moves the MVs by no more than it may. LoopError for a law that does not read
         ``operate``, an unknown name, and a value that is not allowed; then nothing is changed.
         """
-        self._active.set_operate(values)
+        self._active.operate = self.operate_with(values)
+
+    def operate_with(self, values: Mapping[str, float]) -> Array:
+        """``operate`` (n_operate,) as ``set_operate`` would leave it; LoopError where that would refuse."""
+        return self._active.operate_with(values)
 
     def set_mv(self, mv: ArrayLike) -> None:
         """Set the MV (n_mv,) in MANUAL; one with a ``max_move`` goes there scan by scan, see ``mv_wanted``.
