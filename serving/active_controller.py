@@ -180,7 +180,7 @@ class Successor:
     """Steps a new controller on the samples of the one in charge; its MV is shown and not written.
 
     It is ready after ``trial`` good scans in a row: a scan without a sample, one that its own ``guards`` refuse, or one
-    that it cannot compute, starts the count and its law anew. What operators have changed it takes by name.
+    that it cannot compute, starts the count and its law anew. It takes by name the values that operators have changed.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What operators may change of a running law: ranges, uses, ranks, resting values and costs, by one vector."""
+"""Values that operators may change of a running law: ranges, uses, ranks, resting values and costs, by one vector."""
 
 from __future__ import annotations
 
