@@ -286,7 +286,7 @@ class Planner(nn.Module):
     def _damped(
         self, weighed: Tensor, slopes_t: Tensor, stiff: Tensor, pull: Tensor, plan: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Curvature (..., m, m) and pull of a pass that a step away from ``plan`` costs kappa of the outputs' curvature.
+        """Curvature (..., m, m) and pull of a pass; a step away from ``plan`` costs kappa of the outputs' curvature.
 
         With as many MVs as set points it is its diagonal, as without ``operate``. With more, all of it: MVs may move
         together freely as far as no output shows it.
