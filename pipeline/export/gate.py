@@ -270,8 +270,8 @@ def _operated(operate: Operate, rng: np.random.Generator) -> Callable[[], Array]
                     at[i] = float(rng.uniform() < SWITCHED_ON) * e.high
                 elif e.what == "rank":
                     at[i] = round(at[i])
-                elif e.what == "high":  # stands behind its low end
-                    at[i - 1], at[i] = sorted(at[i - 1 : i + 1])
+                elif e.what == "high" and (low := operate.places.get(f"{e.signal}.low")) is not None:
+                    at[[low, i]] = sorted(at[[low, i]])
         return at
 
     return step
