@@ -40,9 +40,9 @@ class PredictiveParams:
     for each MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
     none; None: no limits. A set point beyond a limit counts as one at the limit. ``preview`` of the set points:
     ``held``, as they are now; ``ramp``, their last slope goes on, as in a recipe of ramps; steps to come are not known.
-    ``operate``: the law reads what operators change while it runs, and which readings are fresh. It maps entries such
-    as ``TIC-1.low`` or ``valve.rest`` to other defaults than those of ``entries_of``, and may be empty; None: the law
-    has none of this. ``cv_low`` and ``cv_high`` are then the ranges' defaults.
+    ``operate``: other defaults, by name, of the numbers that operators change while the law runs, as ``TIC-1.low`` or
+    ``valve.rest``, and may be empty: the law then reads these numbers and which readings are fresh, and soft limits
+    are the defaults of its ranges; None: it has none of this.
     """
 
     speed: float = 1.0
