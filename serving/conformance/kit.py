@@ -73,6 +73,11 @@ PASS = (
     "Every number is a hexadecimal float as C's printf writes it with %a and strtod reads it, or nan, inf, -inf.",
 )
 
+PASS_OF_OPERATED = (
+    "given.operate holds what operators change, in the order of the manifest's operate, and given.fresh is 1 for each "
+    "new and good reading, else 0. All scans have the manifest's defaults, and all readings are fresh.",
+)
+
 
 def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
     """Write the kit into ``folder``, which is made if it is not there, and return what ``vectors.json`` holds.
@@ -109,7 +114,7 @@ def vectors_of(controller: Controller) -> dict[str, Any]:
             "processor": platform.machine(),
             "system": platform.system(),
         },
-        "pass": list(PASS),
+        "pass": [*PASS, *(PASS_OF_OPERATED if {"operate", "fresh"} & set(m.inputs) else ())],
         "tolerance": KIT_TOLERANCE.hex(),
         "chained_tolerance": CHAIN_TOLERANCE.hex(),
         "scale": {name: written(values) for name, values in scale.items()},
