@@ -32,7 +32,7 @@ class Operate:
         found = np.array(self.default if base is None else base, dtype=np.float64)
         for name, value in values.items():
             if name not in self.places:
-                raise ContractError(f"operate has no entry {name!r}; it has {', '.join(self.places)}")
+                raise ContractError(f"operate has no entry {name!r}; it has {', '.join(self.places) or 'none'}")
             found[self.places[name]] = value
         return self.checked(found)
 

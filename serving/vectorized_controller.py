@@ -11,7 +11,6 @@ from loopwright.serving.controller import Array, Controller
 from loopwright.serving.errors import ContractError
 from loopwright.serving.operating import Operate
 
-
 STEERING = frozenset({"operate", "fresh"})  # inputs with defaults
 
 

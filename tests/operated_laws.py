@@ -1,4 +1,7 @@
-"""A small law that reads ``operate`` and ``fresh``, exported once a session. Loaded by ``pytest_plugins``, not imported."""
+"""A small law that reads ``operate`` and ``fresh``, exported once a session.
+
+Loaded by ``pytest_plugins``, not imported.
+"""
 
 from __future__ import annotations
 

@@ -55,6 +55,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         "PV=STD",
         "standard deviation of a reading's noise, of a measured disturbance too, over the whole run",
     )
+    events("--operate", "NAME=VALUE", "of what operators may change, another value than the file's default")
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip
     add("--duration", metavar="S", type=positive("s"), help="length of the run")
@@ -78,6 +79,7 @@ def run(options: argparse.Namespace) -> None:
         raise ParamsError("give set points or a scenario, not both")
     require_shipped(options.file)
     controller = Controller(options.file)
+    controller.change_defaults({event.name: event.value for event in options.operate})
     plant, case = _plant_of(controller.manifest)
     course = timetable(
         plant,

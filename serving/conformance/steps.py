@@ -37,7 +37,9 @@ class StepInputs:
     """The inputs of one step without the state. ``cold``: it starts from a state of zeros, else from the last one."""
 
     part: str
-    inputs: dict[str, Array]  # sp (n_sp,), pv (n_pv,), dv (n_dv,), mv_applied (n_mv,); operate, fresh where they are read
+    inputs: dict[
+        str, Array
+    ]  # sp (n_sp,), pv (n_pv,), dv (n_dv,), mv_applied (n_mv,); operate, fresh where they are read
     cold: bool = False
 
 

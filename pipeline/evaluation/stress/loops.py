@@ -110,10 +110,14 @@ class StressOutcome:
 
 @dataclass(frozen=True)
 class Stress:
-    """The needs of a worker for a batch of loops: how they are drawn, and the bytes of the controller file."""
+    """The needs of a worker for a batch of loops: how they are drawn, and the bytes of the controller file.
+
+    ``operate`` holds the values, by name, of what operators have changed; the rest are the file's defaults.
+    """
 
     drawing: Drawing
     content: bytes
+    operate: tuple[tuple[str, float], ...] = ()
 
     @cached_property
     def controller(self) -> Controller:
@@ -121,7 +125,9 @@ class Stress:
         with tempfile.TemporaryDirectory(prefix="loopwright-stress-") as folder:
             path = Path(folder) / "controller.onnx"
             path.write_bytes(self.content)
-            return Controller(path)
+            controller = Controller(path)
+        controller.change_defaults(dict(self.operate))
+        return controller
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}  # a session stays where it was made

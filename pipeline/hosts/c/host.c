@@ -406,17 +406,20 @@ static bool read_operate(Controller *c) {
   return true;
 }
 
-/* Whether a law may be given these values (n_in[OPERATE]), as the manifest's operate lists them. */
-static bool operate_allowed(Controller *c, const double *values) {
-  for (size_t i = 0; i < c->n_in[OPERATE]; i++) {
-    const Operate *e = &c->operate_entries[i];
-    double value = values[i];
-    if (e->low <= value && value <= e->high && (!e->is_switch || value == 0 || value == 1)) continue;
-    if (e->is_switch && e->low < e->high) return failed(c, "operate: %.200s is %.6g; allowed is 0 or 1", e->name, value);
-    return failed(c, "operate: %.200s is %.6g; allowed is %.6g to %.6g%s%.40s", e->name, value, e->low, e->high,
-                  *e->unit ? " " : "", e->unit);
-  }
-  for (size_t i = 0; i < c->n_in[OPERATE]; i++) {
+/* Whether one value may be given, at place i of operate. NaN: false. */
+static bool operate_within(Controller *c, size_t i, double value) {
+  const Operate *e = &c->operate_entries[i];
+  if (e->low <= value && value <= e->high && (!e->is_switch || value == 0 || value == 1)) return true;
+  if (e->is_switch && e->low < e->high) return failed(c, "operate: %.200s is %.6g; allowed is 0 or 1", e->name, value);
+  return failed(c, "operate: %.200s is %.6g; allowed is %.6g to %.6g%s%.40s", e->name, value, e->low, e->high,
+                *e->unit ? " " : "", e->unit);
+}
+
+/* Whether a law may be given these n values, as the manifest's operate lists them. */
+static bool operate_allowed(Controller *c, const double *values, size_t n) {
+  for (size_t i = 0; i < n; i++)
+    if (!operate_within(c, i, values[i])) return false;
+  for (size_t i = 0; i < n; i++) {
     const Operate *e = &c->operate_entries[i];
     if (values[i] > values[e->above])
       return failed(c, "operate: %.150s is %.6g, above %.150s = %.6g; a low end must not be above the high one", e->name,
@@ -428,7 +431,7 @@ static bool operate_allowed(Controller *c, const double *values) {
 /* From the next step on the law has these values (n_in[OPERATE]). False, and nothing changed, where one is not allowed:
    outside its engineered range, a switch neither 0 nor 1, a low end above the high one. */
 static bool controller_operate(Controller *c, const double *values) {
-  if (!operate_allowed(c, values)) return false;
+  if (!operate_allowed(c, values, c->n_in[OPERATE])) return false;
   memcpy(c->operate, values, c->n_in[OPERATE] * sizeof *values);
   return true;
 }
