@@ -43,9 +43,9 @@ to an input without a connection needs <code>use_mv_applied</code> = false.</p>"
 
 
 OPERATED = """<p><code>operate.NAME</code> is what operators may change: a tunable parameter, which may be set before
-any communication step. A value outside its range is refused where it is set, a low end above its high one at the end of the
-initialization and at the next step. <code>fresh.NAME</code> is 1 for a process variable whose reading is new and good,
-0 for one that is neither; these inputs are read where the parameter <code>use_fresh</code> is true.</p>"""
+any communication step. A value outside its range is refused where it is set, a low end above its high one at the end
+of the initialization and at the next step. <code>fresh.NAME</code> is 1 for a process variable whose reading is new
+and good, 0 for one that is neither; these inputs are read where the parameter <code>use_fresh</code> is true.</p>"""
 
 
 def token_of(controller: Controller) -> str:
