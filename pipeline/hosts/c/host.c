@@ -286,7 +286,7 @@ typedef struct {
   double period_s;
   Operate *operate_entries; /* what operators may change, n_in[OPERATE] of them */
   double *operate; /* of all steps; the defaults until controller_operate */
-  double *fresh; /* of the next step: 1 for a new and good reading of each PV, else 0. All 1 until you write it */
+  double *fresh; /* 1 for a new and good reading of each PV, else 0: all 1 unless you write them before a step */
   double *state;       /* what the law remembers: the last step's state_next; zeros: no past */
   double *in[INPUTS];  /* the session reads here */
   double *out[OUTPUTS]; /* and writes here: mv, state_next and info of the last step */
@@ -593,7 +593,8 @@ static bool controller_open(Controller *c, const char *path) {
   c->operate = calloc(c->n_in[OPERATE] + 1, sizeof *c->operate);
   c->fresh = calloc(c->n_in[FRESH] + 1, sizeof *c->fresh);
   if (!c->state || !c->operate || !c->fresh) return failed(c, "no memory");
-  for (size_t k = 0; k < c->n_in[OPERATE]; k++) c->operate[k] = c->in[OPERATE][k] = c->operate_entries[k].standard;
+  for (size_t k = 0; k < c->n_in[OPERATE]; k++) c->in[OPERATE][k] = c->operate_entries[k].standard;
+  if (!controller_operate(c, c->in[OPERATE])) return false;
   for (size_t k = 0; k < c->n_in[FRESH]; k++) c->fresh[k] = c->in[FRESH][k] = 1;
   for (int i = 0; i < STATE; i++)
     for (size_t k = 0; k < c->n_in[i]; k++) c->in[i][k] = middle(&c->signals[i].at[k]);
@@ -658,7 +659,6 @@ static const char *const MODE[] = {"MANUAL", "AUTO", "HOLD"};
 typedef struct {
   const double *pv, *dv, *mv_applied; /* mv_applied NULL: there is no read-back */
   double age_s;
-  const double *fresh; /* 1 for each PV whose reading is new and good, else 0; NULL: all are */
 } Sample;
 
 typedef struct {
@@ -832,7 +832,6 @@ static void loop_take(Loop *l, const Sample *sample) {
   }
   clip(c, sample->mv_applied ? sample->mv_applied : l->mv, l->applied);
   if (!loop_writes(l)) memcpy(l->mv, l->applied, n * sizeof *l->mv);
-  for (size_t k = 0; k < c->n_in[FRESH]; k++) c->fresh[k] = sample->fresh ? sample->fresh[k] : 1;
   const double *const given[STATE] = {[SP] = l->sp, [PV] = sample->pv, [DV] = sample->dv, [MV] = l->applied};
   if (controller_step(c, given) != STEPPED) {
     if (l->mode == AUTO) memcpy(l->mv, l->applied, n * sizeof *l->mv);
@@ -869,7 +868,7 @@ static bool plant_read(Plant *p, Sample *sample) {
     p->pv[i] = s->low + (s->high - s->low) * at;
   }
   for (size_t i = 0; i < p->c->n_in[DV]; i++) p->dv[i] = middle(&p->c->signals[DV].at[i]);
-  *sample = (Sample){.pv = p->pv, .dv = p->dv, .mv_applied = p->mv, .age_s = 0.0};
+  *sample = (Sample){p->pv, p->dv, p->mv, 0.0};
   return true;
 }
 
@@ -1072,6 +1071,7 @@ static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t
   }
   controller_cold(c);
   for (size_t k = 0; k < c->n_in[OPERATE]; k++) c->operate[k] = c->operate_entries[k].standard; /* of all scans */
+  for (size_t k = 0; k < c->n_in[FRESH]; k++) c->fresh[k] = 1;
   if (done) {
     l->recover_after = (int)json_number(json_get(begin, "recover_after"));
     l->max_gap = json_number(json_get(begin, "max_gap"));
