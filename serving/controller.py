@@ -94,6 +94,8 @@ class Controller:
     waits for a step that is under way, so that the child finds buffers, session and lock as between two steps.
     """
 
+    _operate: Operate | None  # of a law that reads operate or fresh
+
     def __init__(self, path: str | PathLike[str], sha256: str | None = None) -> None:
         self.path = Path(path)
         try:

@@ -37,6 +37,8 @@ class VectorizedController:
         self._places = places
         self._given = np.zeros((n, controller.width))
         self._operate = Operate(controller.manifest.operate)
+        usual = {name: np.array(controller.manifest.usual(name)) for name in STEERING}
+        self._defaults: dict[str, Array] = {name: np.tile(values, (n, 1)) for name, values in usual.items()}
 
     def cold_state(self) -> Array:
         """States of zeros, shape (n, n_state): no past."""
@@ -62,17 +64,15 @@ class VectorizedController:
         allowed, with its row. A row with an input that is not finite, or whose output is not finite, outside the MV's
         range or further from ``mv_applied`` than the MV moves in a period, is marked as refused.
         """
-        given: dict[str, Array | None] = {"sp": sp, "pv": pv, "dv": dv, "mv_applied": mv_applied, "state": state}
-        given |= {"operate": operate, "fresh": fresh}
+        given = {"sp": sp, "pv": pv, "dv": dv, "mv_applied": mv_applied, "state": state}
+        given |= {"operate": self._steering("operate", operate), "fresh": self._steering("fresh", fresh)}
         for name, place in self._places.items():
-            value, wanted = given[name], (self.n, place.stop - place.start)
-            if value is None and name in STEERING:
-                value = np.broadcast_to(self.controller.manifest.usual(name), wanted)
-            elif np.shape(value) != wanted:
-                raise ContractError(f"{name} has the shape {np.shape(value)}; {self.n} rows need {wanted}")
-            elif name in STEERING:
-                self._require_allowed(name, np.asarray(value, dtype=np.float64))
-            self._given[:, place] = value
+            wanted = (self.n, place.stop - place.start)
+            if given[name].shape != wanted:
+                raise ContractError(f"{name} has the shape {given[name].shape}; {self.n} rows need {wanted}")
+            if name in STEERING:
+                self._require_allowed(name, given[name])
+            self._given[:, place] = given[name]
         taken = self.controller.compute(self._given)
         mv = taken[:, self._mv].copy()
         allowed: NDArray[np.bool_] = np.all(np.isfinite(taken), axis=1)
@@ -85,8 +85,14 @@ class VectorizedController:
                 allowed &= np.array([signal.moves(before, after) for before, after in pairs])
         return VectorizedStep(mv, taken[:, self._next].copy(), np.logical_not(allowed))
 
+    def _steering(self, name: str, rows: Array | None) -> Array:
+        """``rows`` (n, ...), or the defaults in each."""
+        return self._defaults[name] if rows is None else np.asarray(rows, dtype=np.float64)
+
     def _require_allowed(self, name: str, rows: Array) -> None:
         """ContractError, with its number, for the first row (n, ...) that ``Controller.step`` would not take."""
+        if rows is self._defaults[name]:
+            return
         if name == "fresh":
             good = ((rows == 0) | (rows == 1)).all(axis=1)
             if not good.all():
