@@ -32,15 +32,9 @@ class Operate:
         found = np.array(self.default if base is None else base, dtype=np.float64)
         for name, value in values.items():
             if name not in self.places:
-                raise ContractError(f"operate has no entry {name!r}; it has {', '.join(self.places) or 'none'}")
+                raise ContractError(f"operate has no entry {name!r}; it has {', '.join(self.places)}")
             found[self.places[name]] = value
         return self.checked(found)
-
-    def ordered(self, values: ArrayLike) -> Array:
-        """``values`` (n,) with the ends of a range exchanged where the low one is above the high one."""
-        found = np.array(values, dtype=np.float64)
-        found[self._pairs] = np.sort(found[self._pairs], axis=-1)
-        return found
 
     def checked(self, values: ArrayLike) -> Array:
         """``values`` as float64 (n,); ContractError with the name of the first that is wrong.
@@ -68,3 +62,9 @@ class Operate:
                 f"{given[high]:g}; a low end must not be above the high one"
             )
         return given
+
+    def ordered(self, values: ArrayLike) -> Array:
+        """``values`` (n,) with the ends of a range exchanged where the low one is above the high one."""
+        found = np.array(values, dtype=np.float64)
+        found[self._pairs] = np.sort(found[self._pairs], axis=-1)
+        return found

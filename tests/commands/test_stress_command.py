@@ -64,7 +64,7 @@ def test_what_is_no_number_is_refused(options: list[str], words: str, capsys: py
 
 def test_a_law_that_operators_do_not_steer_takes_no_operate(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["stress", str(PH), "--operate", "u.high=1"]) == 2
-    assert capsys.readouterr().err == "loopwright stress: operate has no entry 'u.high'; it has none\n"
+    assert capsys.readouterr().err.startswith("loopwright stress: operate has no entry 'u.high'")
     assert not list(Path().iterdir())
 
 

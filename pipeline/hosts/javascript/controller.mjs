@@ -22,7 +22,7 @@ const ACTED_ON = ["schema", "period_s", "inputs", "n_state", "info", "sp", "pv",
 
 const SWITCHES = ["use", "track", "rest_use"];
 
-// What operators may change of a law that reads `operate`: the manifest's entries, each by its name, as "y0.low" or "speed".
+// The manifest's entries of `operate`, which operators may change, each by its name, as "y0.low" or "speed".
 export class Operate {
   constructor(entries = []) {
     this.entries = entries.map((e) => ({ ...e, name: e.signal ? `${e.signal}.${e.what}` : e.what }));
