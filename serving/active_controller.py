@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from loopwright.serving.bridging import Bridging, Readings
 from loopwright.serving.controller import Controller, Step
 from loopwright.serving.errors import ContractError, LoopError
-from loopwright.serving.guard import Guard, Sample, refused
+from loopwright.serving.fields import shown
+from loopwright.serving.guard import Guard, Sample
 from loopwright.serving.manifest import INPUTS, Manifest, Signal
-from loopwright.serving.words import named
+from loopwright.serving.operating import Operate
+from loopwright.serving.words import first_line, named
 
 # ---------------------------------------------------------------------- a controller in a loop that reads more signals
 Array: TypeAlias = NDArray[np.float64]
@@ -37,7 +40,15 @@ class AdaptedController(Controller):
         self._pv, self._dv = _places(own.pv, loop.pv), _places(own.dv, loop.dv)
 
     def step(
-        self, *, sp: ArrayLike, pv: ArrayLike, mv_applied: ArrayLike, state: ArrayLike, dv: ArrayLike | None = None
+        self,
+        *,
+        sp: ArrayLike,
+        pv: ArrayLike,
+        mv_applied: ArrayLike,
+        state: ArrayLike,
+        dv: ArrayLike | None = None,
+        operate: ArrayLike | None = None,
+        fresh: ArrayLike | None = None,
     ) -> Step:
         """One step, on all PVs and measured disturbances of the loop."""
         step = self.inner.step(
@@ -46,6 +57,8 @@ class AdaptedController(Controller):
             mv_applied=mv_applied,
             state=state,
             dv=_picked(dv, self._dv, self.manifest.dv, "dv") if "dv" in self.inner.manifest.inputs else None,
+            operate=operate,
+            fresh=None if fresh is None else _picked(fresh, self._pv, self.manifest.pv, "fresh"),
         )
         applied = np.asarray(mv_applied, dtype=np.float64).reshape(step.mv.shape)
         mv = [
@@ -151,31 +164,63 @@ def _shown(signals: Sequence[Signal]) -> str:
 # -------------------------------------------------------------------------- a controller that is tried, and takes over
 
 
+def _inputs(controller: Controller, readings: Readings, operate: Array) -> dict[str, ArrayLike]:
+    """The numbers of PVs, and what else a law of today reads of them and of its operators."""
+    m, found = controller.manifest, dict[str, ArrayLike]()
+    assert readings.pv is not None
+    found["pv"] = readings.pv
+    if "operate" in m.inputs:
+        found["operate"] = operate
+    if "fresh" in m.inputs and readings.fresh is not None:
+        found["fresh"] = readings.fresh
+    return found
+
+
 class Successor:
     """Steps a new controller on the samples of the one in charge; its MV is shown and not written.
 
     It is ready after ``trial`` good scans in a row: a scan without a sample, one that its own ``guards`` refuse, or one
-    that it cannot compute, starts the count and its law anew.
+    that it cannot compute, starts the count and its law anew. It takes by name the values that operators have changed.
     """
 
-    def __init__(self, controller: Controller, trial: int, guards: Sequence[Guard] = ()) -> None:
+    def __init__(
+        self, controller: Controller, trial: int, guards: Sequence[Guard] = (), bridging: Bridging | None = None
+    ) -> None:
         self.controller, self.trial, self.guards = controller, trial, guards
+        self.bridging = bridging or Bridging(controller.manifest)
+        self.operating = Operate(controller.manifest.operate)
+        self.operate = self.operating.default  # shape: (n_operate,)
         self.state = controller.cold_state()
         self.good = 0
         self.mv: Array | None = None  # shape: (n_mv,), of the last scan; None where there is none
         self.reason = ""  # why the last scan gave no MV
 
-    def step(self, sample: Sample, sp: Array, applied: Array, past: Collection[Sample] = ()) -> None:
-        """One scan; ``past`` ends with the sample before it."""
-        if reason := refused(self.guards, sample, past):
-            self.miss(reason)
+    def step(
+        self,
+        sample: Sample,
+        sp: Array,
+        applied: Array,
+        past: Collection[Sample] = (),
+        operated: tuple[Operate, Array] | None = None,
+    ) -> None:
+        """One scan; ``past`` ends with the sample before it, ``operated`` is of the controller in charge."""
+        if operated is not None:
+            try:
+                self.operate = self.operating.taken_over(*operated)
+            except ContractError as error:
+                self.miss(first_line(error))
+                return
+        readings = self.bridging.look(sample, self.guards, past, self.operate)
+        if readings.reason:
+            self.miss(readings.reason)
             return
         for s, value in zip(self.controller.manifest.sp, sp.tolist(), strict=True):
             if not s.low <= value <= s.high:
                 self.miss(f"the set point {s.name} = {value:g} is outside its range [{s.low:g}, {s.high:g}] {s.unit}")
                 return
         try:
-            step: Step = self.controller.step(sp=sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self.state)
+            more = _inputs(self.controller, readings, self.bridging.used(self.operate, readings))
+            step: Step = self.controller.step(sp=sp, dv=sample.dv, mv_applied=applied, state=self.state, **more)
         except Exception as error:  # the controller in charge goes on, whatever this one does
             self.miss(named(error))
             return
@@ -200,31 +245,50 @@ class ActiveController:
     """The controller in charge with the state of its law, its guards and the samples that they look back to.
 
     ``guards`` are a host's own, or what makes them for a controller's manifest: they are then made anew for each
-    controller that takes over.
+    controller that takes over. ``bridge_s`` and ``critical`` are of ``Bridging``. ``operate`` (n_operate,) is what
+    operators have changed of the law; whoever takes over has it by name, and its own defaults for the rest.
     """
 
-    def __init__(self, controller: Controller, guards: Guards) -> None:
+    def __init__(
+        self, controller: Controller, guards: Guards, *, bridge_s: float | None = None, critical: Sequence[str] = ()
+    ) -> None:
         self.controller = controller
         self.replaced: Controller | None = None  # the one that was in charge before the present one
         self.successor: Successor | None = None  # tried beside the controller
+        self.operating = Operate(controller.manifest.operate)
+        self.operate = self.operating.default
         self._made = guards if callable(guards) else None
         self.guards: tuple[Guard, ...] = tuple(guards(controller.manifest) if callable(guards) else guards)
+        self._bridging = Bridging(controller.manifest, bridge_s, critical)
         self._state = controller.cold_state()
         self._past = deque[Sample](maxlen=_longest(self.guards))
         self._before: tuple[Sample, ...] = ()  # the past of the present sample, for the successor
 
-    def refusal(self, sample: Sample) -> str | None:
-        """Why not to act on a sample; None where nothing speaks against it."""
-        if not isinstance(sample, Sample):
-            return f"the sample is of the type {type(sample).__name__}; it must be a Sample"
-        if sample.fault:
-            return sample.fault if isinstance(sample.fault, str) else str(sample.fault)
-        return refused(self.guards, sample, self._past)
+    def look(self, sample: Sample) -> Readings:
+        """The readings of a sample that the law may act on, or why it may not."""
+        readings = self._bridging.look(sample, self.guards, self._past, self.operate)
+        if readings.reason and self.successor is not None:
+            self.successor.bridging.missed()
+        return readings
 
-    def step(self, sample: Sample, sp: Array, applied: Array) -> Step:
+    def operate_with(self, values: Mapping[str, float]) -> Array:
+        """``operate`` (n_operate,) with some values by name; LoopError for a wrong name or value, or a law without."""
+        m = self.controller.manifest
+        if "operate" not in m.inputs:
+            raise LoopError(f"{m.law} has no operate: nothing of it can be changed while it runs but its set points")
+        if not isinstance(values, Mapping):
+            raise LoopError(f"operate is {shown(values)}; it needs numbers by name: {', '.join(self.operating.places)}")
+        try:
+            return self.operating.with_values(values, self.operate)
+        except ContractError as error:
+            raise LoopError(first_line(error)) from error
+
+    def step(self, readings: Readings, sp: Array, applied: Array) -> Step:
         """One step of the law. It raises what the law raises; ``forget`` then, as the state is of no use any more."""
+        sample = readings.sample
         self._before = tuple(self._past) if self.successor is not None else ()
-        step = self.controller.step(sp=sp, pv=sample.pv, dv=sample.dv, mv_applied=applied, state=self._state)
+        more = _inputs(self.controller, readings, self._bridging.used(self.operate, readings))
+        step = self.controller.step(sp=sp, dv=sample.dv, mv_applied=applied, state=self._state, **more)
         if self._past.maxlen:
             self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
         self._state = step.state
@@ -235,10 +299,11 @@ class ActiveController:
         new = self.successor
         if new is None:
             return None
-        new.step(sample, sp, applied, self._before)
+        new.step(sample, sp, applied, self._before, (self.operating, self.operate))
         if new.ready:
             self.replaced, self.successor = self.controller, None
             self.controller, self._state = new.controller, new.state
+            self.operating, self.operate, self._bridging = new.operating, new.operate, new.bridging
             if self._made is not None:
                 self.guards = tuple(new.guards)
                 self._past = deque(self._past, maxlen=_longest(self.guards))
@@ -249,7 +314,14 @@ class ActiveController:
         if trial < 1:
             raise LoopError(f"trial is {trial}; a controller is tried for at least one scan")
         new = adapted(controller, loop)
-        self.successor = Successor(new, trial, () if self._made is None else tuple(self._made(new.manifest)))
+        guards = () if self._made is None else tuple(self._made(new.manifest))
+        self.successor = Successor(new, trial, guards, self._bridging.beside(new.manifest))
+
+    def missed(self, periods: int) -> None:
+        """So many periods passed without a sample."""
+        self._bridging.missed(periods)
+        if self.successor is not None:
+            self.successor.bridging.missed(periods)
 
     def forget(self, reason: str) -> None:
         """No past any more."""

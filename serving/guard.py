@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Protocol, TypeAlias
 
@@ -89,7 +89,8 @@ class Sample:
     the time since the PVs were measured; ``late`` names those whose own age it is, where that is not all of them.
     ``fault`` says why the endpoint does not trust its own sample; empty: it does. ``quality`` is for the journal and
     the page: an OPC UA status for each PV, then each MV, then each measured disturbance that is read; empty: the
-    endpoint has none.
+    endpoint has none. ``bad_pv`` says for each PV why its reading alone is not trusted, empty where it is; an empty
+    tuple: all are. A law that reads ``fresh`` goes on without these, see ``loopwright.serving.bridging``.
     """
 
     pv: Array  # shape: (n_pv,)
@@ -99,10 +100,18 @@ class Sample:
     fault: str = ""
     quality: tuple[int, ...] = ()
     late: str = ""
+    bad_pv: tuple[str, ...] = ()  # shape: (n_pv,), or empty
+
+    def is_bad(self, i: int) -> bool:
+        """Whether the reading of PV ``i`` is known to be bad: no guard judges it again."""
+        return bool(self.bad_pv) and bool(self.bad_pv[i])
 
 
 class Guard(Protocol):
-    """One reason not to act: a text, or a ``loopwright.serving.guard.Fault``, which also says which reason it is."""
+    """One reason not to act: a text, or a ``loopwright.serving.guard.Fault``, which also says which reason it is.
+
+    A fault with the subject "PV T" speaks against the reading of this PV alone; a law that reads ``fresh`` bridges it.
+    """
 
     @property
     def memory(self) -> int:
@@ -140,8 +149,8 @@ class Complete:
             numbers = values.tolist()
             if isfinite(sum(numbers)):
                 continue
-            for signal, value in zip(signals, numbers, strict=True):  # a sum of finite numbers may overflow
-                if not isfinite(value):
+            for i, (signal, value) in enumerate(zip(signals, numbers, strict=True)):  # a finite sum may overflow
+                if not isfinite(value) and not (label == "PV" and sample.is_bad(i)):
                     return Fault(f"{label} {signal.name} is {value}", "number", f"{label} {signal.name}")
         return None
 
@@ -156,9 +165,9 @@ class InRange:
 
     def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
         """Why not: a sensor beyond its range is broken, or the plant is where the law was never tested."""
-        for s, value in zip(self.signals, sample.pv.tolist(), strict=True):
+        for i, (s, value) in enumerate(zip(self.signals, sample.pv.tolist(), strict=True)):
             slack = self.margin * (s.high - s.low)
-            if not s.low - slack <= value <= s.high + slack:
+            if not s.low - slack <= value <= s.high + slack and not sample.is_bad(i):
                 words = f"PV {s.name} is {value:.6g} {s.unit}, outside its range [{s.low:g}, {s.high:g}] {s.unit}"
                 return Fault(words, "range", f"PV {s.name}")
         return None
@@ -202,7 +211,7 @@ class Frozen:
         if len(recent) < self.memory:
             return None
         for i, s in enumerate(self.signals):
-            if all(old.pv[i] == sample.pv[i] for old in recent):
+            if all(old.pv[i] == sample.pv[i] for old in recent) and not sample.is_bad(i):
                 words = f"PV {s.name} is frozen at {sample.pv[i]:.6g} {s.unit} for {self.samples} samples"
                 return Fault(words, "frozen", f"PV {s.name}")
         return None
@@ -245,9 +254,10 @@ class Rate:
         """Why not: faster than the process can, so it is the sensor."""
         if not past:
             return None
-        moves = np.abs(sample.pv - list(past)[-1].pv).tolist()
-        for s, move, largest in zip(self.signals, moves, self.largest, strict=True):
-            if not move <= largest:
+        last = list(past)[-1]
+        moves = np.abs(sample.pv - last.pv).tolist()
+        for i, (s, move, largest) in enumerate(zip(self.signals, moves, self.largest, strict=True)):
+            if not move <= largest and not (sample.is_bad(i) or last.is_bad(i)):
                 words = f"PV {s.name} moved by {move:.6g} {s.unit} in one sample; allowed are {largest:g} {s.unit}"
                 return Fault(words, "rate", f"PV {s.name}")
         return None
@@ -268,6 +278,27 @@ def refused(guards: Sequence[Guard], sample: Sample, past: Collection[Sample]) -
         except Exception as error:
             return f"{type(guard).__name__} failed: {first_line(error)}"
     return None
+
+
+def refused_apart(
+    guards: Sequence[Guard], sample: Sample, past: Collection[Sample], signals: Sequence[Signal]
+) -> tuple[str | None, Sample]:
+    """Why a sample is refused, or None; and the sample, with what speaks against single PVs alone in ``bad_pv``.
+
+    ``signals`` are the PVs. A guard whose fault has one of them for its subject is asked again without that PV.
+    """
+    places = {f"PV {s.name}": i for i, s in enumerate(signals)}
+    for guard in guards:
+        while reason := refused((guard,), sample, past):
+            place = places.get(reason.subject) if isinstance(reason, Fault) else None
+            if place is None:
+                return reason, sample
+            if sample.is_bad(place):  # a guard that looks at all PVs, whatever is known of them
+                break
+            bad = list(sample.bad_pv or ("" for _ in signals))
+            bad[place] = reason
+            sample = replace(sample, bad_pv=tuple(bad))
+    return None, sample
 
 
 def implausible(signals: Sequence[Signal], applied: Sequence[float]) -> str | None:

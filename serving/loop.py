@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import inf, isnan, nan
 from typing import TypeAlias
@@ -36,7 +36,8 @@ class ControlLoop:
     the applied MV, so the transfer to AUTO is bumpless. HOLD keeps the last applied MV. SHADOW writes
     nothing: the law is stepped on what others do with the plant. A fault in AUTO changes the mode to
     HOLD, and the command names the reason; ``recover_after`` good samples change it back. A fault that
-    lasts is for ``fallback``. After a gap the law starts cold (state = 0).
+    lasts is for ``fallback``. After a gap the law starts cold (state = 0). A law that reads ``fresh`` goes on without a
+    PV whose reading alone is bad; the command names it.
 
     A command that did not reach the plant (``unwritten``) leaves it unknown where the MV stands: others may move it
     meanwhile. The next read-back tells, also that of a sample which is refused for another reason. HOLD, MANUAL and
@@ -77,11 +78,16 @@ class ControlLoop:
         is where the law wants it; 0: at once. See ``loopwright.serving.modes``.
     fallback
         What to do when a fault lasts; None: the MV stays. See ``loopwright.serving.modes``.
+    operate
+        Values of the law's ``operate`` by name at the start; its defaults for the rest.
+    bridge_s, critical
+        Time for which the bad reading of a PV is bridged [s], ten periods unless given, and the names of PVs without
+        which the loop holds after it. See ``loopwright.serving.bridging``.
 
     Raises
     ------
     LoopError
-        A set point or MV outside its range, or of the wrong length.
+        A set point or MV outside its range, or of the wrong length; a name or a value that is none of ``operate``.
     """
 
     def __init__(
@@ -99,6 +105,9 @@ class ControlLoop:
         max_gap: int = 3,
         transfer_s: float = 0.0,
         fallback: Fallback | None = None,
+        operate: Mapping[str, float] | None = None,
+        bridge_s: float | None = None,
+        critical: Sequence[str] = (),
     ) -> None:
         mode = mode_of(mode)
         if recover_after is not None and recover_after < 1:
@@ -106,7 +115,10 @@ class ControlLoop:
         if not 0 <= transfer_s < inf:
             raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         manifest = controller.manifest
-        self._active = ActiveController(controller, default_guards if guards is None else guards)
+        guards = default_guards if guards is None else guards
+        self._active = ActiveController(controller, guards, bridge_s=bridge_s, critical=critical)
+        if operate:
+            self.set_operate(operate)
         self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
         self.endpoint = endpoint
         self.recover_after = recover_after
@@ -208,6 +220,23 @@ class ControlLoop:
         """Change the set points (n_sp,); LoopError outside their ranges."""
         self._sp = within(sp, self.controller.manifest.sp, "set point")
 
+    @property
+    def operate(self) -> Array:
+        """Present values of ``operate``, shape (n_operate,), as the manifest of the controller in charge lists them."""
+        return self._active.operate.copy()
+
+    def set_operate(self, values: Mapping[str, float]) -> None:
+        """Change some of ``operate`` by name, from the next scan on.
+
+        No transfer begins: the law moves the MVs by no more than it may. LoopError for a law that does not read
+        ``operate``, an unknown name, and a value that is not allowed; then nothing is changed.
+        """
+        self._active.operate = self.operate_with(values)
+
+    def operate_with(self, values: Mapping[str, float]) -> Array:
+        """``operate`` (n_operate,) as ``set_operate`` would leave it; LoopError where that would refuse."""
+        return self._active.operate_with(values)
+
     def set_mv(self, mv: ArrayLike) -> None:
         """Set the MV (n_mv,) in MANUAL; one with a ``max_move`` goes there scan by scan, see ``mv_wanted``.
 
@@ -227,8 +256,8 @@ class ControlLoop:
     # ------------------------------------------------------------------ one scan
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
-        reason = self._active.refusal(sample)
-        self._refused_why = ""
+        readings = self._active.look(sample)
+        reason, self._refused_why = readings.reason, ""
         self._applied.arrived()
         shown = self._applied.look(sample, self._mv, refused=bool(reason))
         self.found = shown.found
@@ -236,7 +265,7 @@ class ControlLoop:
             if shown.outside:
                 self._mv = np.full(len(self._mv), nan)
             doubled = not reason or shown.silent.startswith(reason)
-            both = shown.silent if doubled else reworded(reason or "", f"{reason}; {shown.silent}")
+            both = shown.silent if doubled else reworded(reason, f"{reason}; {shown.silent}")
             return self._without_sample(both, silent=True)
         if self.found is not None:
             self._mv, self._hand.wanted = self.found.copy(), None
@@ -250,7 +279,7 @@ class ControlLoop:
                 applied = self._applied.read_back(sample, self._mv)
             if isnan(self._mv[0]):
                 self._mv = applied.copy()
-            step = self._active.step(sample, self._sp, applied)
+            step = self._active.step(readings, self._sp, applied)
         except Exception as error:  # the plant needs an MV after any error
             if self.mode in {Mode.AUTO, Mode.SHADOW}:
                 self._mv = applied
@@ -264,16 +293,19 @@ class ControlLoop:
             self._mv = applied.copy()
         self._mv = self._hand.toward(self._mv, self.controller.manifest.mv)
         before = self.controller
-        beside = self._active.beside(sample, self._sp, applied)
+        beside = self._active.beside(readings.sample, self._sp, applied)
         if self.controller is not before:
             self._transfer.begin()
         self._lasting()
-        return self._command(step.mv, step.info, self.fault, beside)
+        command = self._command(step.mv, step.info, self.fault, beside)
+        bad = readings.bridged or readings.shed
+        return replace(command, bridged=readings.bridged, shed=readings.shed) if bad else command
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
         self._applied.arrived()
         self.found = None
+        self._active.missed(1)
         return self._without_sample(reason)
 
     def _without_sample(self, reason: str, *, silent: bool = False) -> Command:
@@ -298,6 +330,7 @@ class ControlLoop:
 
     def gap(self, periods: int) -> None:
         """So many periods passed without a scan; the law starts cold after more than ``max_gap``."""
+        self._active.missed(periods)
         if periods > self.max_gap:
             self._active.begin_cold(f"{periods} periods were missed")
             self._transfer.begin()  # a law that starts cold may want another MV at once

@@ -123,7 +123,9 @@ OF_GROUP: Mapping[str, frozenset[str]] = {
 
 @dataclass(frozen=True, slots=True)
 class OperateEntry:
-    """One number of ``operate``: what of which signal, its default, and the engineered range that it stays within.
+    """One number of ``operate``: ``what`` of which signal, its ``default``, its ``unit`` and its engineered range.
+
+    ``group`` says of what it is one: a controlled variable (cv), an MV, or the whole law.
 
     ``use`` 0 takes a signal out; ``track`` 0 leaves a controlled variable alone within ``low`` and ``high``; ``rank``
     1 keeps its range before 2; ``max_move`` is a period's; ``rest`` is where an MV goes that nothing asks for, where

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import StrEnum
 from math import inf, isfinite, isnan
 from typing import TypeAlias
@@ -148,6 +148,9 @@ class Command:
     A host that runs the loop itself writes ``mv`` where ``writes`` is true: not in SHADOW, and not while ``mv`` is NaN
     because no sample has told yet where the MV stands. Where ``hand_back`` is true, it gives the plant back to the
     plant's own controller, and then sets the mode to SHADOW.
+
+    ``bridged`` and ``shed`` have the PVs whose readings were bad while the law went on, each with the reason: the law
+    predicts the first, and leaves the second alone (``loopwright.serving.bridging``).
     """
 
     scan: int
@@ -159,6 +162,8 @@ class Command:
     fault: str = ""
     successor_mv: Array | None = None  # shape: (n_mv,), of a controller that is tried beside the law; else None
     hand_back: bool = False
+    bridged: Mapping[str, str] = field(default_factory=dict)
+    shed: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def writes(self) -> bool:

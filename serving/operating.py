@@ -1,4 +1,4 @@
-"""What operators may change of a running law: ranges, uses, ranks, resting values and costs, by one vector."""
+"""Values that operators may change of a running law: ranges, uses, ranks, resting values and costs, by one vector."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopwright.serving.errors import ContractError
+from loopwright.serving.fields import nearest, shown
 from loopwright.serving.manifest import SWITCHES, OperateEntry
 from loopwright.serving.ranges import numbers
 
@@ -32,9 +33,24 @@ class Operate:
         found = np.array(self.default if base is None else base, dtype=np.float64)
         for name, value in values.items():
             if name not in self.places:
-                raise ContractError(f"operate has no entry {name!r}; it has {', '.join(self.places)}")
-            found[self.places[name]] = value
+                raise ContractError(f"operate has no entry {shown(name)}{nearest(name, self.places)}")
+            try:
+                number = numbers(value)
+            except TypeError as error:
+                raise ContractError(f"operate: {name} {error}; it needs a number") from error
+            if number.shape:
+                raise ContractError(f"operate: {name} has the shape {number.shape}; it needs one number")
+            found[self.places[name]] = number
         return self.checked(found)
+
+    def taken_over(self, others: Operate, values: Array) -> Array:
+        """The values (n,) by name of another law's ``others`` with ``values``, the defaults where it has none.
+
+        ContractError where one of them is outside its range here.
+        """
+        if others.entries == self.entries:
+            return values
+        return self.with_values({n: float(values[i]) for n, i in others.places.items() if n in self.places})
 
     def checked(self, values: ArrayLike) -> Array:
         """``values`` as float64 (n,); ContractError with the name of the first that is wrong.

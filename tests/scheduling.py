@@ -32,7 +32,7 @@ KEEP_TIME = (
     *("test_page_attacks.py", "test_loop_certificates.py", "test_browser_host.py", "test_two_loops.py"),
     *("test_steering.py", "test_page_signers_in_browser.py", "test_page.py", "test_sending.py"),
     *("test_playground_of_a_made_plant_in_browser.py", "test_signed_steering.py", "test_quality.py"),
-    *("test_watching.py", "test_starting.py"),
+    *("test_watching.py", "test_starting.py", "test_operate_on_server.py"),
 )
 LONG = (
     *("test_laws_contract.py", "test_pipeline.py", "test_real_servers.py", "test_drifts_of_every_case.py"),

@@ -146,7 +146,8 @@ class Monitor:
         self._follow(time_s, sample, command)
         if command.mode is not Mode.SHADOW:
             self.hold.add(float(command.mode is Mode.HOLD))
-        if sample is None or command.mode is not Mode.AUTO or command.law_mv is None:
+        apart = command.bridged or command.shed  # a law that goes on without a reading is no measure of itself
+        if sample is None or command.mode is not Mode.AUTO or command.law_mv is None or apart:
             if command.mode in {Mode.SHADOW, Mode.MANUAL}:  # a batch's end; a fault is none
                 self.batches.end(time_s)
             self._gap()
@@ -185,7 +186,7 @@ class Monitor:
         if before is None or applied.shape != before.shape or not np.isfinite(applied).all():
             return
         error = None
-        if command.mode is Mode.AUTO:
+        if command.mode is Mode.AUTO and not (command.bridged or command.shed):
             off = np.abs(np.asarray(sample.pv, dtype=np.float64)[: len(command.sp)] - command.sp) / self._sp_span
             error = float(off.max())
         self.following.add(applied, before, error, time_s)

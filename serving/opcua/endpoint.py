@@ -7,13 +7,14 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.serving.errors import EndpointError, LoopError
-from loopwright.serving.guard import Sample
+from loopwright.serving.guard import Fault, Sample
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.link import Link
 from loopwright.serving.opcua.mv_sender import HAND_BACK, Heartbeat, MvSender
@@ -148,12 +149,30 @@ class OpcUaEndpoint:
         # a young MV.
         mv = values.mv if self.sender.told_on and now - values.arrived_s <= self.max_age_s else None
         late = self._late(values, now)
-        return Sample(values.pv, mv, values.dv, age * self.speed, values.fault, values.quality, late)
+        sample = Sample(
+            values.pv, mv, values.dv, age * self.speed, values.fault, values.quality, ", ".join(late), values.bad_pv
+        )
+        return self._late_apart(sample, values, late, now) if late and self._sampling.apart else sample
 
-    def _late(self, values: Values, now: float) -> str:
+    def _late(self, values: Values, now: float) -> list[str]:
         """The signals that are too old, where others are not."""
         late = [name for name, age in values.ages.items() if now - values.arrived_s + age > self.max_age_s]
-        return ", ".join(late) if len(late) == 1 or len(late) < len(values.ages) else ""
+        return late if len(late) == 1 or len(late) < len(values.ages) else []
+
+    def _late_apart(self, sample: Sample, values: Values, late: list[str], now: float) -> Sample:
+        """The sample with its late PVs among those that are bad alone: its age is that of the others."""
+        names = [f"PV {s.name}" for s in self.manifest.pv]
+        rest = [age for name, age in values.ages.items() if name not in late or name not in names]
+        if not rest:  # nothing else has come either
+            return sample
+        said = values.bad_pv or ("",) * len(names)
+        bad = [
+            why or (Fault(f"{name} is older than {self.max_age_s * self.speed:.3g} s", "age", name) * (name in late))
+            for name, why in zip(names, said, strict=True)
+        ]
+        age = now - values.arrived_s + max(rest)
+        others = ", ".join(name for name in late if name not in names)
+        return replace(sample, age_s=age * self.speed, late=others, bad_pv=tuple(bad))
 
     def write(self, mv: Array) -> None:
         """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection.

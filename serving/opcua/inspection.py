@@ -14,7 +14,7 @@ from asyncua import ua
 
 from loopwright.serving.errors import EndpointError
 from loopwright.serving.guard import InRange, Sample, implausible
-from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.manifest import SWITCHES, Manifest, Signal
 from loopwright.serving.opcua.certificates import last_day, valid_until
 from loopwright.serving.opcua.link import Link
 from loopwright.serving.opcua.nameplates import (
@@ -287,7 +287,7 @@ def _one(server: Server, row: Row, asked: _Asked | str, margin: float) -> Found:
         wrong = "it may not be written by this user"
     elif signal is not None:
         wrong, passing = _refused(row, signal, number, margin), True
-    note = ""
+    note = _no_value(row, number) if not reading.text else ""
     if signal is not None:
         outside = "" if wrong or reading.text else _outside(signal, number)
         misfit = other_unit(unit, point, signal)
@@ -298,6 +298,15 @@ def _one(server: Server, row: Row, asked: _Asked | str, margin: float) -> Found:
         wrong, note = "", "; ".join(filter(None, (wrong, note)))
     shown = "-" if reading.text else f"{number:.6g}"
     return Found(name, node, kind, shown, unit, quality, age, limits, MAY[writable], wrong, note, passing, row.written)
+
+
+def _no_value(row: Row, number: float) -> str:
+    """Why a node's number is no value of ``operate``; it is no request then, and stops nothing. Empty: it is one."""
+    e = row.entry
+    if e is None or (e.low <= number <= e.high and (e.what not in SWITCHES or number in (0.0, 1.0))):
+        return ""
+    allowed = "0 or 1" if e.what in SWITCHES else f"{e.low:g} to {e.high:g} {e.unit}".rstrip()
+    return f"{number:.6g} is none that it may have; allowed is {allowed}"
 
 
 def _other_range(limits: str, point: Point, signal: Signal) -> str:

@@ -12,7 +12,7 @@ from asyncua import ua
 from numpy.typing import NDArray
 
 from loopwright.serving.errors import EndpointError, LoopError
-from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.manifest import Manifest, OperateEntry, Signal
 from loopwright.serving.opcua.link import Link
 from loopwright.serving.opcua.node_lease import SeveralLeasesError, beside
 from loopwright.serving.opcua.settings import NO_LEASE, Nodes, Point
@@ -29,6 +29,7 @@ class Role(Enum):
     MV = "MV"
     DV = "DV"
     SP = "SP"
+    OPERATE = "operate"
     MODE = "mode"
     WATCHDOG = "watchdog"
     HEARTBEAT = "heartbeat"
@@ -48,11 +49,13 @@ class Row:
     signal: Signal | None = None
     judged: bool = False
     written: bool = False
+    entry: OperateEntry | None = None
 
     @property
     def title(self) -> str:
-        """Role and signal, such as "MV T_j"."""
-        return self.role.value if self.signal is None else f"{self.role.value} {self.signal.name}"
+        """Role and signal, such as "MV T_j", or "operate T.low"."""
+        of = self.entry if self.signal is None else self.signal
+        return self.role.value if of is None else f"{self.role.value} {of.name}"
 
     @property
     def name(self) -> str:
@@ -67,7 +70,7 @@ class Row:
     @property
     def request(self) -> bool:
         """Whether the plant's own operator asks for something by it."""
-        return self.role in {Role.SP, Role.MODE}
+        return self.role in {Role.SP, Role.OPERATE, Role.MODE}
 
     @property
     def measured(self) -> bool:
@@ -88,11 +91,13 @@ class NodePlan:
         self.dvs = [s for s in manifest.dv if s.name in nodes.dv]
         pv, mv, dv, sp = (nodes.points(n) for n in ("pv", "mv", "dv", "sp"))
         used, wanted = "dv" in manifest.inputs, {s.name: s for s in manifest.sp}
+        entries = {e.name: e for e in manifest.operate}
         self.rows = [
             *(Row(Role.PV, pv[s.name], s, judged=True) for s in manifest.pv),
             *(Row(Role.MV, mv[s.name], s, judged=True) for s in manifest.mv),
             *(Row(Role.DV, dv[s.name], s, judged=used) for s in self.dvs),
             *(Row(Role.SP, point, wanted[name]) for name, point in sp.items()),
+            *(Row(Role.OPERATE, point, entry=entries[name]) for name, point in nodes.points("operate").items()),
         ]
         self.timed = [i for i, row in enumerate(self.rows) if row.ages]
         if nodes.mode is not None:
@@ -151,7 +156,7 @@ class NodePlan:
         read = zip(self.rows, self.asked, strict=False)
         written = zip(self.outputs, self.written, strict=True)
         return [
-            *((row, at) for row, at in read if row.judged or row.role is Role.SP),
+            *((row, at) for row, at in read if row.judged or row.role in {Role.SP, Role.OPERATE}),
             *((row, at) for row, (at, _) in written),
         ]
 

@@ -94,7 +94,10 @@ SLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Values:
-    """Result of one reading. ``quality`` has a status for each PV, then each MV, then each DV that is read."""
+    """Result of one reading. ``quality`` has a status for each PV, then each MV, then each DV that is read.
+
+    ``fault`` speaks against all of it; ``bad_pv`` against single PVs, in a text for each, or empty.
+    """
 
     arrived_s: float  # on the endpoint's clock
     pv: Array  # shape: (n_pv,)
@@ -108,6 +111,8 @@ class Values:
     ages: Mapping[str, float] = field(default_factory=dict)  # [s] of each measured value, by name
     starts: int = 0  # how often the server has started anew since the endpoint did
     unheard: Mapping[str, str] = field(default_factory=dict)  # why a set point or the mode is no request, by name
+    bad_pv: tuple[str, ...] = ()
+    asked_operate: Mapping[str, float] = field(default_factory=dict)
 
 
 class NodeSampling:
@@ -116,6 +121,7 @@ class NodeSampling:
     def __init__(self, manifest: Manifest, server: Server, nodes: Nodes, nameplates: Nameplates | None = None) -> None:
         self.manifest, self.server, self.nodes = manifest, server, nodes
         self.nameplates = nameplates or Nameplates(nodes, manifest)
+        self.apart = "fresh" in manifest.inputs  # whether a law goes on without a PV whose reading alone is bad
         self._watched = float("nan"), 0  # the watchdog, and for how many readings it has stood there
         self._dead, self._slow = "", False  # why the plant counts as dead; whether its watchdog has moved since
 
@@ -131,6 +137,7 @@ class NodeSampling:
     ) -> Values:
         """Values that arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not arrive."""
         fault, typed, found, unheard = "", "", dict[str, float](), dict[str, str]()
+        bad = list[str]()
         for row, answer in zip(plan.rows, answers, strict=False):
             name, point = row.name, row.point
             usable = answer.quality == STATUS_GOOD or (
@@ -148,14 +155,11 @@ class NodeSampling:
                     if row.request:
                         unheard[name] = changed
                     typed = typed or ("" if row.request else changed)
-            if fault or not row.judged:
-                continue
-            if answer.quality == STATUS_BAD or (
-                answer.quality == STATUS_UNCERTAIN and self.server.uncertain == "fault"
-            ):
-                fault = Fault(f"{name}: {answer.words}", f"quality {answer.words}", name)
-            elif answer.text:
-                fault = Fault(f"{name}: {_given(row, answer.text)}", "number", name)
+            if row.judged and not (fault and row.role is not Role.PV):
+                why = self._wrong(row, answer)
+                if row.role is Role.PV:
+                    bad.append(why)
+                fault = fault or ("" if self.apart and row.role is Role.PV else why)
         judge = self.server.source_time == "judge"
         timed = ages.update(arrived_s, [answers[i].source_s if judge else None for i in plan.timed])
         m = self.manifest
@@ -181,7 +185,20 @@ class NodeSampling:
             {plan.rows[i].name: age for i, age in zip(plan.timed, timed, strict=True)},
             starts,
             unheard,
+            tuple(bad) if self.apart and any(bad) else (),
+            {
+                e.name: found[f"operate {e.name}"]
+                for e in m.operate
+                if np.isfinite(found.get(f"operate {e.name}", np.nan))
+            },
         )
+
+    def _wrong(self, row: Row, answer: NodeReading) -> str:
+        """Why a value is not used; empty: it is."""
+        name = row.name
+        if answer.quality == STATUS_BAD or (answer.quality == STATUS_UNCERTAIN and self.server.uncertain == "fault"):
+            return Fault(f"{name}: {answer.words}", f"quality {answer.words}", name)
+        return Fault(f"{name}: {_given(row, answer.text)}", "number", name) if answer.text else ""
 
     def dead(self, watchdog: float) -> str:
         """Why the server's side counts as dead; empty while its watchdog moves.

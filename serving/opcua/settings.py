@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import nearest
-from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.manifest import Manifest, OperateEntry, Signal
 
+Group: TypeAlias = Literal["pv", "dv", "mv", "sp", "operate"]
 NO_LEASE = "none"  # nodes.lease: none is looked for
 
 
@@ -71,12 +72,14 @@ class Nodes:
     ``heartbeat`` counts the loop's scans. ``watchdog`` is a number that the server's side changes while it lives; it
     counts as dead after ``watchdog_scans`` scans without a change. ``lease`` is a text that holds who controls this
     plant. Without it a node LoopwrightLease is the lease that lies beside those of the MVs; "none": there is no lease.
+    ``operate`` has nodes by which the plant's own operator changes values of the law's ``operate``, each by its name.
     """
 
     pv: Mapping[str, str | Point]
     mv: Mapping[str, str | Point]
     dv: Mapping[str, str | Point] = field(default_factory=dict)
     sp: Mapping[str, str | Point] = field(default_factory=dict)
+    operate: Mapping[str, str | Point] = field(default_factory=dict)
     mode: ModeNode | None = None
     heartbeat: str = ""
     watchdog: str = ""
@@ -88,13 +91,13 @@ class Nodes:
         if self.watchdog_scans < 1:
             raise LoopError(f"watchdog_scans is {self.watchdog_scans}; it must be at least 1")
 
-    def points(self, name: Literal["pv", "dv", "mv", "sp"]) -> dict[str, Point]:
-        """The points of one group by signal name."""
+    def points(self, name: Group) -> dict[str, Point]:
+        """The points of one group by signal name, those of ``operate`` by its entries'."""
         return {n: Point(p) if isinstance(p, str) else p for n, p in getattr(self, name).items()}
 
     def ids(self) -> list[str]:
         """Every node id that is given, as it is written."""
-        groups: tuple[Literal["pv", "dv", "mv", "sp"], ...] = ("pv", "dv", "mv", "sp")
+        groups: tuple[Group, ...] = ("pv", "dv", "mv", "sp", "operate")
         points = [p for name in groups for p in self.points(name).values()]
         others = [p.node for p in (self.mode, self.hand_back) if p is not None]
         texts = [*(t for p in points for t in (p.node, p.read_back)), *others]
@@ -102,11 +105,12 @@ class Nodes:
 
     def check(self, manifest: Manifest) -> None:
         """LoopError where a signal that the law needs has no node, or a node no signal."""
-        groups: tuple[tuple[Literal["pv", "dv", "mv", "sp"], tuple[Signal, ...]], ...] = (
+        groups: tuple[tuple[Group, tuple[Signal | OperateEntry, ...]], ...] = (
             ("pv", manifest.pv), ("mv", manifest.mv), ("dv", manifest.dv), ("sp", manifest.sp),
+            ("operate", manifest.operate),
         )  # fmt: skip
-        for name, signals in groups:
-            points, known = self.points(name), [s.name for s in signals]
+        for name, entries in groups:
+            points, known = self.points(name), [s.name for s in entries]
             for given in points:
                 if given not in known:
                     raise LoopError(f"nodes.{name} has {given!r}, which the controller has not{nearest(given, known)}")

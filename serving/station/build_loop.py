@@ -62,6 +62,9 @@ def control_loop(
         warm_lead_s=WARM_LEAD_S * s.speed,
         transfer_s=s.over_s(m.period_s),
         fallback=s.hold.fallback(m.mv),
+        operate=s.operate,
+        bridge_s=s.fresh.bridge_s,
+        critical=s.fresh.critical,
     )
 
 
@@ -151,7 +154,9 @@ NAMESPACES, NODES = "namespaces", "nodes"  # what they are kept under
 def usable(values: Values | None) -> bool:
     """Whether a loop may begin where these values say that the plant is."""
     return (
-        values is not None and not values.fault and bool(np.isfinite(values.pv).all() and np.isfinite(values.mv).all())
+        values is not None
+        and not (values.fault or values.bad_pv)
+        and bool(np.isfinite(values.pv).all() and np.isfinite(values.mv).all())
     )
 
 

@@ -77,11 +77,12 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
             action="store_true",
             help="let a controller into AUTO although its file does not prove it",
         )
-    for name, words in (("sp", "set points"), ("mv", "MVs, in MANUAL")):
+    operate = "what operators may change of the law: ranges, uses, limits"
+    for name, words in (("sp", "set points"), ("mv", "MVs, in MANUAL"), ("operate", operate)):
         values = commands.add_parser(name, help=f"change {words}")
         values.add_argument("values", metavar="NAME=VALUE", nargs="+", help="of one or more signals, in their units")
     state = commands.add_parser("state", help="how the loop stands, as JSON")
-    for parser in (swap, mode, *(commands.choices[name] for name in ("sp", "mv")), state):
+    for parser in (swap, mode, *(commands.choices[name] for name in ("sp", "mv", "operate")), state):
         parser.add_argument("--loop", metavar="LOOP.TOML", type=Path, default=SETTINGS, help="which (%(default)s)")
         if parser is not state:
             parser.add_argument("--who", default=_user(), help="written down (%(default)s)")
@@ -101,6 +102,7 @@ def _state(options: argparse.Namespace) -> int:
         about, state = (ask(journal, {"do": do}) for do in ("about", "state"))
     signals = {group: [s["name"] for s in about["signals"][group]] for group in ("sp", "pv", "mv", "dv")}
     names = {**signals, **dict.fromkeys(("applied", "law", "beside"), signals["mv"]), "info": about["info"]}
+    names["operate"] = [e["name"] for e in about["operate"]]
     for group, of in names.items():
         if state.get(group) is not None:
             state[group] = dict(zip(of, state[group], strict=True))
@@ -113,7 +115,7 @@ def _ask(options: argparse.Namespace) -> int:
     do, value = options.action, None
     if do == "mode":
         value = options.mode
-    elif do in {"sp", "mv"}:
+    elif do in {"sp", "mv", "operate"}:
         value = dict(_pair(text) for text in options.values)
     elif options.back or options.keep:
         do, value = ("back", {"trial": options.trial}) if options.back else ("keep", None)

@@ -33,6 +33,7 @@ class Recorder:
         self.journal, self._say, self._speed = journal, say, speed
         self._controller: Controller | None = None
         self._fault, self._trial, self._mode = "", "", ""
+        self._bad: dict[str, bool] = {}  # PVs that were bridged, or left out (True)
 
     @property
     def controller(self) -> Controller:
@@ -84,11 +85,31 @@ class Recorder:
             before, self._fault = self._fault, command.fault
             what = lasting(command.fault) or f"over: {lasting(before)}"
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.fault))
+        self._bridged(command)
         self._changed(command)
         if loop.controller is not self.controller:
             self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")
             self.begin(loop.controller)
         self._tried(loop)
+
+    def _bridged(self, command: Command) -> None:
+        """Say which PVs are bridged, left out, which is an alarm, and read again; a scan without a sample says none."""
+        if command.law_mv is None:
+            return
+        now = {**dict.fromkeys(command.bridged, False), **dict.fromkeys(command.shed, True)}
+        for name in [*now, *(n for n in self._bad if n not in now)]:
+            before, out = self._bad.get(name), now.get(name)
+            alarm = f"reading {name}"
+            if out == before:
+                continue
+            if out is not None:
+                why = lasting({**command.bridged, **command.shed}[name])
+                words = f"PV {name} is left out" if out else f"PV {name} is bridged"
+                self.note("fault", "loop", f"{words}: {why}", alarm=alarm if out else "", raised=out)
+            else:
+                words = f"PV {name} is read again"
+                self.note("fault", "loop", f"over: {words}" if before else words, alarm=alarm if before else "")
+        self._bad = now
 
     def _changed(self, command: Command) -> None:
         """Say that the mode is another one though nobody asked for it: HOLD by a fault, and the way back."""

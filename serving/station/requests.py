@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from loopwright.serving.active_controller import require_fits
 from loopwright.serving.controller import Controller
@@ -21,11 +21,20 @@ from loopwright.serving.trust import require_accepted, signer
 MODE = "mode"
 
 
+class Asked(NamedTuple):
+    """Requests of the plant's own operator: set points by name, the mode, values of ``operate`` by name."""
+
+    sp: dict[str, float]
+    mode: str
+    operate: dict[str, float]
+
+
 class NodeRequests:
     """Requests of the plant's own operator by nodes: a value that has changed is one.
 
-    The set points that stand there when the loop begins are requests, too; the mode is none. The values of a server
-    that has started anew are its defaults: nobody asked for them, and they are no request until they change.
+    The set points and the values of ``operate`` that stand there when the loop begins are requests, too; the mode is
+    none. The values of a server that has started anew are its defaults: nobody asked for them, and they are no request
+    until they change.
     """
 
     def __init__(self) -> None:
@@ -33,14 +42,16 @@ class NodeRequests:
         self.starts = 0  # of the server, as far as its values were looked at
         self._unheard: Mapping[str, str] = {}
 
-    def of(self, values: Values) -> tuple[dict[str, float], str]:
-        """Set points by name, and the mode, that are asked for with these values; empty where there is no request."""
+    def of(self, values: Values) -> Asked:
+        """The requests of these values; empty where there are none."""
         if values.starts != self.starts:
             self.starts = values.starts
             self._stands.clear()
         points = {n: v for n, v in values.asked_sp.items() if self._changed(f"SP {n}", v, first=self.starts == 0)}
+        first = self.starts == 0
+        operate = {n: v for n, v in values.asked_operate.items() if self._changed(f"operate {n}", v, first=first)}
         mode = values.asked_mode
-        return points, mode if mode and self._changed(MODE, mode, first=False) else ""
+        return Asked(points, mode if mode and self._changed(MODE, mode, first=False) else "", operate)
 
     def refused(self, values: Values) -> list[str]:
         """Why a set point or the mode is no request, in a line for each; each is told once while it lasts."""
@@ -110,9 +121,10 @@ def change(request: Request, loop: ControlLoop, opened: Opened) -> Change:
 
     A file of another controller is read here, by ``opened``, so that no scan waits for it.
     """
-    made = {"mode": _mode, "sp": _sp, "mv": _mv, "swap": _swap, "keep": _keep, "back": _back}.get(request.do)
+    does = {"mode": _mode, "sp": _sp, "mv": _mv, "operate": _operate, "swap": _swap, "keep": _keep, "back": _back}
+    made = does.get(request.do)
     if made is None:
-        known = ("mode", "sp", "mv", "swap", "keep", "back", "acknowledge", "state", "about")
+        known = (*does, "acknowledge", "state", "about")
         raise LoopError(f"the loop cannot {request.do!r}{nearest(request.do, known)}")
     return made(request, loop, opened)
 
@@ -169,6 +181,20 @@ def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
         loop.set_mv(_numbers(request.value, signals, loop.mv_wanted.tolist(), "MV"))
 
     return Change(act, what, request.who, request.reason)
+
+
+def _operate(request: Request, loop: ControlLoop, _: Opened) -> Change:
+    entries, present = loop.controller.manifest.operate, loop.operate
+    wanted = loop.operate_with(request.value)
+    if not request.value:
+        raise LoopError(f"a value of operate is given by name: {', '.join(e.name for e in entries)}")
+    moves = [
+        f"{e.name} {old:g} -> {new:g} {e.unit}".rstrip()
+        for e, old, new in zip(entries, present.tolist(), wanted.tolist(), strict=True)
+        if old != new
+    ]
+    what = f"operate {', '.join(moves) or 'as it was'}"
+    return Change(lambda loop: loop.set_operate(request.value), what, request.who, request.reason)
 
 
 def _swap(request: Request, loop: ControlLoop, opened: Opened) -> Change:

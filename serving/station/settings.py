@@ -9,6 +9,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Literal
 
+from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import nearest, parse, refused
@@ -61,6 +62,22 @@ class Guards:
                     raise LoopError(f"guards.rate has {name!r}, which is no PV{nearest(name, known)}")
             guards.append(Rate(manifest.pv, tuple(self.rate.get(name, float("inf")) for name in known)))
         return tuple(guards)
+
+
+@dataclass(frozen=True, slots=True)
+class Bridge:
+    """The PVs whose reading alone is bad, for a law that reads ``fresh``; any other holds at once.
+
+    The law predicts such a PV for ``bridge_s`` [s] (None: ten periods) and then leaves it out; without one of the
+    ``critical`` PVs, or without any controlled one, the loop holds then.
+    """
+
+    bridge_s: float | None = None
+    critical: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.bridge_s is not None and not (isfinite(self.bridge_s) and self.bridge_s >= 0):
+            raise LoopError(f"bridge_s is {self.bridge_s}; it must be a finite number of seconds, 0 or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +138,8 @@ class Settings:
 
     ``trusted`` names public keys: only a controller that one of them signed is loaded, at the start and by a swap
     (None: any is). ``accept_unproven`` lets a controller into AUTO whose file does not prove it in closed loop, see
-    ``loopwright.serving.trust``. ``page`` is HOST:PORT or a table (see ``loopwright.serving.page.process``); empty:
+    ``loopwright.serving.trust``. ``operate`` has values of the law's ``operate`` by name that the loop begins with, in
+    place of the law's own. ``page`` is HOST:PORT or a table (see ``loopwright.serving.page.process``); empty:
     none.
     """
 
@@ -135,6 +153,8 @@ class Settings:
     speed: float = 1.0
     transfer_s: float | None = None
     guards: Guards = Guards()
+    fresh: Bridge = Bridge()
+    operate: Mapping[str, float] = field(default_factory=dict)
     hold: Hold = Hold()
     journal: JournalSettings = JournalSettings()
     page: str | Page = ""
@@ -259,6 +279,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         "",
         "# [nodes.sp]  # set points that the plant's own operator sets",
         *(f"# {_node('SP', s)}" for s in m.sp),
+        *_operate_nodes(m),
         "",
         "[nodes]  # what the two sides tell each other; leave out what the plant has not",
         f'heartbeat = "{_id("Control", "Heartbeat")}"  # counts the scans, for the plant to watch',
@@ -272,6 +293,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         "margin = 0.05  # share of a PV's range by which it may exceed it",
         "frozen = 0  # samples for which a PV may stand still to the bit; 0: for ever",
         f"# rate = {_table(m.pv, lambda s: (s.high - s.low) / 10)}  # largest change a scan",
+        *_fresh(m),
         "",
         "[hold]  # what follows a fault",
         "recover_after = 5  # good samples until AUTO; 0: only the operator",
@@ -295,6 +317,33 @@ def _ordered(lines: Sequence[str]) -> list[str]:
     end = lines.index("", start)
     first = lines.index('# The node of every signal: a node id, or { node = "...", scale = 1.0, offset = 0.0 } with')
     return [*lines[:first], *lines[start : end + 1], *lines[first:start], *lines[end + 1 :]]
+
+
+def _operate_nodes(m: Manifest) -> list[str]:
+    if not m.operate:
+        return []
+    return [
+        "",
+        "# [nodes.operate]  # values that the plant's own operator sets: ranges, uses, limits",
+        *(
+            f"# {_text(e.name)} = {_text(_id('Operate', e.name))}  # {e.low:g} .. {e.high:g} {plain(e.unit)}".rstrip()
+            for e in m.operate
+        ),
+        "",
+        "# [operate]  # values that the loop begins with, in place of the law's own",
+        f"# {_text(m.operate[0].name)} = {m.operate[0].default:g}",
+    ]
+
+
+def _fresh(m: Manifest) -> list[str]:
+    if "fresh" not in m.inputs:
+        return []
+    return [
+        "",
+        "[fresh]  # a PV whose reading alone is bad",
+        f"bridge_s = {BRIDGE_PERIODS * m.period_s:g}  # [s] for which the law predicts it; then it is left out",
+        f"# critical = [{_text(m.pv[0].name)}]  # without these the loop holds then",
+    ]
 
 
 def _id(group: str, name: str) -> str:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -20,7 +19,7 @@ from loopwright.serving.first_steps import tried
 from loopwright.serving.guard import Sample
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.loop import Command, ControlLoop, Mode
-from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.certificates import expiries
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.nameplates import Identity, others_since
@@ -41,8 +40,9 @@ from loopwright.serving.station.build_loop import (
 from loopwright.serving.station.control import Answer, Control
 from loopwright.serving.station.housekeeping import LinePrinter, PeriodicTask
 from loopwright.serving.station.mv_lock import Lease, Locks
+from loopwright.serving.station.plant_side import PlantSide, shown_values
 from loopwright.serving.station.recorder import MonitorRunner, Recorder
-from loopwright.serving.station.requests import Change, NodeRequests, Request, change, require_proven
+from loopwright.serving.station.requests import Change, Request, change
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.station.views import Snapshot, about, picture, state
 from loopwright.serving.trust import Controller as TrustedController
@@ -63,7 +63,7 @@ class Station:
     """Runs the loop of some settings.
 
     Between two scans it carries out the changes that were asked for (``ask``) and those of the plant's own operator
-    (set points and mode by their nodes). Every scan, change and fault goes into the journal.
+    (set points, values of ``operate`` and mode by their nodes). Every scan, change and fault goes into the journal.
 
     ``tell`` gets a line of each event, in a thread of its own: it may block or raise. ``controller`` is the one of the
     settings' file; None: it is loaded here, once another process has taken its first steps
@@ -122,7 +122,7 @@ class Station:
         self.ended = False
         self.page: PageProcess | None = None
         self._watchers: list[Callable[[Sample | None, Command], None]] = []
-        self.node_requests = NodeRequests()
+        self.plant_side = PlantSide(settings, m, self.recorder)
         self._seen_before = nodes_before(settings.journal.file)
 
     @property
@@ -240,7 +240,7 @@ class Station:
             self.recorder.note(change.kind, change.who, change.what, change.reason, mode=change.mode)
         values = self.endpoint.values
         if values is not None and self.scans:
-            self._plant_side(self.loop, values)
+            self.plant_side.carry_out(self.loop, values)
         self.locks.keep(self.loop)
 
     def _at_last(self, loop: ControlLoop) -> None:
@@ -250,44 +250,7 @@ class Station:
             self._begun_unseen = False
             if loop.sp.tolist() == near(None, sp):
                 loop.set_sp(near(values.pv[: len(sp)], sp))
-                self.recorder.note("change", "loop", f"set point {_shown(loop.sp, sp)}", "where the plant stands")
-
-    def _plant_side(self, loop: ControlLoop, values: Values) -> None:
-        """Set points and mode, where the plant's own operator changed them."""
-        starts = self.node_requests.starts
-        changed, mode = self.node_requests.of(values)
-        if self.node_requests.starts != starts and (self.settings.nodes.sp or self.settings.nodes.mode is not None):
-            what = "the plant's server has, or may have, started anew: the set points and the mode that stand there"
-            self.recorder.note("connection", "opcua", f"{what} are no wish of its operator until they change")
-        for why in self.node_requests.refused(values):
-            self.recorder.note("change", "plant", f"refused: {why}")
-        if changed:
-            self._set_points(loop, changed)
-        if mode:
-            self._from_plant(partial(self._set_mode, loop, Mode(mode)), f"mode {mode}", Mode(mode))
-
-    def _set_points(self, loop: ControlLoop, changed: Mapping[str, float]) -> None:
-        """Each for itself: one outside its range takes no other one with it."""
-        for i, s in enumerate(self.manifest.sp):
-            if s.name in changed:
-                wanted = loop.sp
-                wanted[i] = changed[s.name]
-                what = f"set point {_shown(wanted[i : i + 1], (s,))}"
-                self._from_plant(partial(loop.set_sp, wanted), what)
-
-    def _set_mode(self, loop: ControlLoop, mode: Mode) -> str:
-        """Set it; what is not proven of a controller that was accepted all the same."""
-        unproven = require_proven(loop, self.settings.accept_unproven) if mode is Mode.AUTO else ""
-        loop.set_mode(mode)
-        return f"accepted though {unproven}" if unproven else ""
-
-    def _from_plant(self, act: Callable[[], str | None], what: str, mode: Mode | None = None) -> None:
-        try:
-            reason = act() or ""
-        except LoopError as error:
-            self.recorder.note("change", "plant", f"refused: {what} ({first_line(error)})")
-            return
-        self.recorder.note("change", "plant", what, reason, mode=mode)
+                self.recorder.note("change", "loop", f"set point {shown_values(loop.sp, sp)}", "where the plant stands")
 
     def _observe(self, sample: Sample | None, command: Command) -> None:
         """Write the scan down, and show it."""
@@ -310,7 +273,7 @@ class Station:
         """Say where an MV stands that somebody else moved while the loop could not write."""
         if loop.found is None or self._left_at is None or np.array_equal(loop.found, self._left_at):
             return
-        found, left = (_shown(mv, self.manifest.mv) for mv in (loop.found, self._left_at))
+        found, left = (shown_values(mv, self.manifest.mv) for mv in (loop.found, self._left_at))
         self.recorder.note("change", "plant", f"the MV stands at {found}, not at {left}: the loop goes on from there")
 
     # ------------------------------------------------------------------ requests
@@ -382,7 +345,3 @@ class Station:
 
     def _connection(self, what: str) -> None:
         self.recorder.note("connection", "opcua", what, alarm="connection", raised=not self.endpoint.connected)
-
-
-def _shown(values: Array, signals: tuple[Signal, ...]) -> str:
-    return ", ".join(f"{s.name} {v:g} {s.unit}" for s, v in zip(signals, values.tolist(), strict=True))

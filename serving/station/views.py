@@ -44,6 +44,7 @@ class Snapshot:
     replaced: Controller | None
     missed: int  # periods
     faults: int  # scans
+    operate: tuple[float, ...]  # as operators want it of the controller in charge
     verdicts: tuple[Verdict, ...]
     numbers: Mapping[str, float]
 
@@ -63,7 +64,8 @@ class Snapshot:
         if new is not None:
             successor = {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
         told = tuple(monitor.verdicts()), monitor.numbers()
-        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, *told)
+        operate = tuple(map(float, loop.operate))
+        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, operate, *told)
 
 
 def about(station: Station) -> View:
@@ -77,6 +79,7 @@ def about(station: Station) -> View:
         "speed": station.settings.speed,
         "signals": {name: [s.to_dict() for s in signals] for name, signals in groups.items()},
         "info": list(m.info),
+        "operate": [{"name": e.name, **e.to_dict()} for e in m.operate],
         "columns": columns(m),
         "card": _card(controller),
         "folder": str(controller.path.absolute().parent),
@@ -119,6 +122,9 @@ def state(station: Station) -> View:
         "beside": _plain(command.successor_mv),
         "dv": _plain(None if sample is None else sample.dv),
         "info": _plain(command.info if seen.stepped is seen.controller else None),  # of the names in ``about``
+        "operate": list(seen.operate),  # of the names in ``about``
+        "bridged": dict(command.bridged),
+        "shed": dict(command.shed),
         "quality": [] if sample is None else [words(status) for status in sample.quality],
         "sha256": seen.controller.sha256,
         "successor": seen.successor,

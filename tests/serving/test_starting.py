@@ -23,7 +23,7 @@ from loopwright.serving.loop import Command, within
 from loopwright.serving.opcua.nameplates import Identity
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.opcua.settings import Nodes, Server
-from loopwright.serving.station import station
+from loopwright.serving.station import plant_side, station
 from loopwright.serving.station.build_loop import another_before, namespaces_before
 from loopwright.serving.station.command import _Lines
 from loopwright.serving.station.mv_lock import Lease
@@ -239,7 +239,7 @@ def test_a_set_point_of_the_plants_side_outside_its_range_takes_no_other_one_wit
     made, _ = make_station("SHADOW")
     a = made.manifest.sp[0]
     signals = tuple(replace(a, name=name) for name in ("one", "two", "three"))
-    monkeypatch.setattr(Station, "manifest", property(lambda _: SimpleNamespace(sp=signals)))
+    made.plant_side.manifest = SimpleNamespace(sp=signals)
 
     class Loop:
         points = np.array([0.1, 0.2, 0.3])
@@ -252,7 +252,7 @@ def test_a_set_point_of_the_plants_side_outside_its_range_takes_no_other_one_wit
             self.points = within(wanted, signals, "set point")
 
     loop: Any = Loop()
-    made._set_points(loop, {"one": 0.5, "two": 99.0, "three": 0.7})
+    made.plant_side.set_points(loop, {"one": 0.5, "two": 99.0, "three": 0.7})
     assert loop.sp.tolist() == [0.5, 0.2, 0.7]
     made.journal.close()
     said = events(made)
@@ -305,10 +305,10 @@ def test_auto_by_the_plants_own_node_is_journalled_with_what_was_accepted(
     unproven: str, make_station: Callable[..., tuple[Station, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, _ = make_station("MANUAL", accept_unproven=True)
-    monkeypatch.setattr(station, "require_proven", lambda loop, accepted: unproven)
+    monkeypatch.setattr(plant_side, "require_proven", lambda loop, accepted: unproven)
     loop: Any = SimpleNamespace(set_mode=lambda mode: None)
-    made._from_plant(lambda: made._set_mode(loop, Mode.AUTO), "mode AUTO")
-    made._from_plant(lambda: made._set_mode(loop, Mode.MANUAL), "mode MANUAL")
+    made.plant_side.carried_out(lambda: made.plant_side.set_mode(loop, Mode.AUTO), "mode AUTO")
+    made.plant_side.carried_out(lambda: made.plant_side.set_mode(loop, Mode.MANUAL), "mode MANUAL")
     made.journal.close()
     with closing(JournalReader(made.settings.journal.file)) as reader:
         found = [(e.what, e.reason) for _, e in reader.events()]
