@@ -75,7 +75,10 @@ PASS = (
 
 PASS_OF_OPERATED = (
     "given.operate holds what operators change, in the order of the manifest's operate, and given.fresh is 1 for each "
-    "new and good reading, else 0. All scans have the manifest's defaults, and all readings are fresh.",
+    "new and good reading, else 0. All scans have the manifest's defaults.",
+    "In a scan the bad reading of one PV does not refuse the sample: for ten periods the law is stepped with fresh = 0 "
+    "and the PV's last good number, then also with its use = 0. The sample is refused where no controlled variable is "
+    "left, where the law has no use of this PV, and where the PV was not read yet.",
 )
 
 

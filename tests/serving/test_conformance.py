@@ -167,6 +167,18 @@ def test_a_kit_holds_what_operators_change(steered: tuple[Controller, Path], vec
     assert not {"operate", "fresh"} & set(vectors["steps"][0]["given"])
 
 
+def test_a_kit_holds_readings_that_stay_bad(steered: tuple[Controller, Path]) -> None:
+    """Of one PV: bridged, then left out. Of all: HOLD once none is left."""
+    scans = json.loads((steered[1] / VECTORS).read_text())["scans"]
+    known = {row["what"]: (row["mode"], row["fault"]) for row in scans}
+    for k in range(1, 14):
+        assert known[f"PV y0 is bad for {k} scans"] == ("AUTO", False)
+        assert known[f"all PVs are bad for {k} scans"] == (("AUTO", False) if k <= 10 else ("HOLD", True))
+    assert scans[-1]["mode"] == "AUTO"
+    moves = [row["mv"] for row in scans if row["what"].startswith("PV y0 is bad")]
+    assert len(set(map(tuple, moves))) > 5  # the law goes on
+
+
 @pytest.mark.parametrize("left_out", [None, "operate", "fresh"])
 def test_a_host_that_leaves_operators_out_does_not_pass(
     left_out: str | None, steered: tuple[Controller, Path], tmp_path: Path

@@ -267,6 +267,7 @@ typedef struct {
   const char *unit;
   double standard, low, high; /* its default, and the engineered range */
   bool is_switch;             /* 0 or 1 */
+  bool of_cv;                 /* of a controlled variable */
   size_t above; /* of a low end: the place of the high one, which it must not exceed; its own place of any other */
 } Operate;
 
@@ -390,6 +391,7 @@ static bool read_operate(Controller *c) {
     e->standard = json_number(json_get(row, "default"));
     e->low = json_number(json_get(row, "low"));
     e->high = json_number(json_get(row, "high"));
+    e->of_cv = !strcmp(json_word(row, "group"), "cv");
     e->is_switch = !strcmp(what, "use") || !strcmp(what, "track") || !strcmp(what, "rest_use");
     if (!(e->low <= e->standard && e->standard <= e->high) || !isfinite(e->high - e->low))
       return failed(c, "operate: %.200s has no range with a default in it", e->name);
@@ -651,6 +653,7 @@ static Outcome controller_step(Controller *c, const double *const given[STATE]) 
 
 /* ------------------------------------------------------------------ the loop: modes, limits, faults */
 #define PV_MARGIN 0.05        /* share of a PV's range beyond which the sensor is broken */
+#define BRIDGE_PERIODS 10     /* a law's own prediction is as good as its model, and loads go on unseen meanwhile */
 #define READ_BACK_MARGIN 0.02 /* share of an MV's range by which scaling may carry a sound read-back over its ends */
 
 typedef enum { MANUAL, AUTO, HOLD } Mode; /* the MV is the operator's, the law's, the last one after a fault */
@@ -670,6 +673,13 @@ typedef struct {
   bool lost;      /* the last command did not reach the plant, and nothing has told since where the MV stands */
   double max_gap; /* missed periods in a row after which the law starts cold */
   double *sp, *mv, *applied, *before; /* mv is NAN while nobody knows where it stands */
+  /* Of a law that reads fresh, by PV: the last good number, periods since then, whether it is bad, predicted, or left
+     out of what the law controls now, and whether the loop holds rather than leave it out. */
+  double *last, *gone;
+  bool *bad, *bridged, *shed, *critical;
+  double bridge_s; /* for so long a bad reading is predicted */
+  double *pv;      /* numbers for the law */
+  double *told;    /* fresh and operate as they were set, while a step has others */
   double *wanted; /* where an operator sent the MV, while by_hand: it goes there by at most its max_move a period */
   bool by_hand;
   char reason[WORDS]; /* of the last scan; empty: no fault */
@@ -680,7 +690,17 @@ typedef struct {
 static bool loop_writes(const Loop *l) { return !isnan(l->mv[0]) && !l->lost; }
 
 static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
-  *l = (Loop){.c = c, .mode = mode, .recover_after = recover_after, .max_gap = 3};
+  size_t n = c->n_in[PV] + 1;
+  *l = (Loop){.c = c, .mode = mode, .recover_after = recover_after, .max_gap = 3, .bridge_s = BRIDGE_PERIODS * c->period_s};
+  l->last = calloc(n, sizeof *l->last);
+  l->gone = calloc(n, sizeof *l->gone);
+  l->bad = calloc(n, sizeof *l->bad);
+  l->bridged = calloc(n, sizeof *l->bridged);
+  l->shed = calloc(n, sizeof *l->shed);
+  l->critical = calloc(n, sizeof *l->critical);
+  l->pv = calloc(n, sizeof *l->pv);
+  l->told = calloc(n + c->n_in[OPERATE], sizeof *l->told);
+  for (size_t i = 0; l->last && i < n; i++) l->last[i] = NAN;
   l->sp = calloc(c->n_in[SP] + 1, sizeof *l->sp);
   l->mv = calloc(c->n_in[MV] + 1, sizeof *l->mv);
   l->applied = calloc(c->n_in[MV] + 1, sizeof *l->applied);
@@ -688,7 +708,8 @@ static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
   l->wanted = calloc(c->n_in[MV] + 1, sizeof *l->wanted);
   for (size_t i = 0; l->sp && i < c->n_in[SP]; i++) l->sp[i] = middle(&c->signals[SP].at[i]);
   for (size_t i = 0; l->mv && i < c->n_in[MV]; i++) l->mv[i] = NAN;
-  return l->sp && l->mv && l->applied && l->before && l->wanted;
+  return l->sp && l->mv && l->applied && l->before && l->wanted && l->last && l->gone && l->bad && l->bridged && l->shed &&
+         l->critical && l->pv && l->told;
 }
 
 static void loop_close(Loop *l) {
@@ -697,6 +718,14 @@ static void loop_close(Loop *l) {
   free(l->applied);
   free(l->before);
   free(l->wanted);
+  free(l->last);
+  free(l->gone);
+  free(l->bad);
+  free(l->bridged);
+  free(l->shed);
+  free(l->critical);
+  free(l->pv);
+  free(l->told);
 }
 
 /* Set points (SP); or the MV (MV) from an operator in MANUAL, to which it goes by at most its max_move a period, or that the plant has, while it is not known. False, and
@@ -740,8 +769,14 @@ static void loop_set_mode(Loop *l, Mode mode) {
   l->good = 0;
 }
 
+/* Periods without readings. */
+static void loop_missed(Loop *l, double periods) {
+  for (size_t k = 0; k < l->c->n_in[PV]; k++) l->gone[k] += periods;
+}
+
 /* So many periods passed without a scan. */
 static void loop_gap(Loop *l, double periods) {
+  loop_missed(l, periods);
   if (periods > l->max_gap) controller_cold(l->c);
 }
 
@@ -779,21 +814,25 @@ static void clip(const Controller *c, const double *applied, double *to) {
   for (size_t k = 0; k < c->n_in[MV]; k++) to[k] = fmin(fmax(applied[k], s[k].low), s[k].high);
 }
 
-/* Why not to act on a sample, in c->words; true if there is no reason. */
-static bool trusted(Controller *c, const Sample *sample) {
+/* Why not to act on a sample, in c->words; true if there is no reason. `bad` takes what speaks against single PVs alone;
+   NULL: it speaks against the sample. */
+static bool trusted(Controller *c, const Sample *sample, bool *bad) {
   const double *const values[STATE] = {[PV] = sample->pv, [DV] = sample->dv};
   for (int i = PV; i <= DV; i++) {
     if (i == DV && !c->uses[DV]) continue;
     if (!values[i] && c->n_in[i]) return failed(c, "the sample has no %s", INPUT[i]);
-    for (size_t k = 0; k < c->n_in[i]; k++)
-      if (!isfinite(values[i][k])) return failed(c, "%s %s is %g", INPUT[i], c->signals[i].at[k].name, values[i][k]);
+    for (size_t k = 0; k < c->n_in[i]; k++) {
+      bool wrong = !isfinite(values[i][k]) || (i == PV && bad && !may_be(&c->signals[PV].at[k], values[PV][k], PV_MARGIN));
+      if (i == PV && bad) bad[k] = wrong;
+      else if (wrong) return failed(c, "%s %s is %g", INPUT[i], c->signals[i].at[k].name, values[i][k]);
+    }
   }
   size_t wrong = sample->mv_applied ? implausible(c, sample->mv_applied) : c->n_in[MV];
   if (wrong < c->n_in[MV]) {
     const Signal *s = &c->signals[MV].at[wrong];
     return failed(c, "applied MV %s is %g %s, which no actuator can hold", s->name, sample->mv_applied[wrong], s->unit);
   }
-  for (size_t k = 0; k < c->n_in[PV]; k++) {
+  for (size_t k = 0; !bad && k < c->n_in[PV]; k++) {
     const Signal *s = &c->signals[PV].at[k];
     if (!may_be(s, sample->pv[k], PV_MARGIN))
       return failed(c, "PV %s is %g %s, outside its range", s->name, sample->pv[k], s->unit);
@@ -816,10 +855,68 @@ static void loop_found(Loop *l, const double *applied, bool good_one) {
     clip(l->c, applied, l->mv);
 }
 
+/* The place in operate of a PV's use; n_in[OPERATE] where it has none. */
+static size_t use_of(const Controller *c, size_t pv) {
+  char name[WORDS];
+  snprintf(name, sizeof name, "%.256s.use", c->signals[PV].at[pv].name);
+  size_t i = operate_place(c, name);
+  return i < c->n_in[OPERATE] && c->operate_entries[i].of_cv ? i : c->n_in[OPERATE];
+}
+
+/* Which PVs with bad readings are predicted and which are left out, and the numbers for the law in l->pv. A law that
+   reads fresh goes on without a PV whose reading is bad: for bridge_s it predicts the PV, then its use is 0 until the
+   reading is good again. False where no PV is left that is in use, where one is gone for longer that is critical or has
+   no use, and where one was never read. */
+static bool loop_bridge(Loop *l, const double *pv) {
+  Controller *c = l->c;
+  size_t n = c->n_in[PV], first = n;
+  bool left = false, any = false;
+  for (size_t k = 0; k < n; k++) {
+    l->gone[k] = l->bad[k] ? l->gone[k] + 1 : 0;
+    if (!l->bad[k]) l->last[k] = pv[k];
+    l->pv[k] = l->last[k];
+  }
+  for (size_t k = 0; k < n; k++) {
+    const char *name = c->signals[PV].at[k].name;
+    size_t use = use_of(c, k);
+    if (l->bad[k] && isnan(l->last[k])) return failed(c, "PV %s is %g; it has not been read yet", name, pv[k]);
+    l->bridged[k] = l->bad[k] && (l->gone[k] - 1) * c->period_s < l->bridge_s;
+    l->shed[k] = l->bad[k] && !l->bridged[k];
+    if (l->shed[k] && l->critical[k]) return failed(c, "PV %s is %g; the loop needs this PV", name, pv[k]);
+    if (l->shed[k] && use == c->n_in[OPERATE]) return failed(c, "PV %s is %g; the law cannot leave this PV out", name, pv[k]);
+    if (l->shed[k] && first == n) first = k;
+    bool wanted = use < c->n_in[OPERATE] && c->operate[use] > 0;
+    any = any || wanted;
+    left = left || (wanted && !l->shed[k]);
+  }
+  if (first < n && any && !left)
+    return failed(c, "PV %s is %g; no controlled variable is left", c->signals[PV].at[first].name, pv[first]);
+  return true;
+}
+
+/* A step with bad PVs not fresh, and those that are left out not in use. */
+static Outcome loop_step(Loop *l, const double *const given[STATE]) {
+  Controller *c = l->c;
+  size_t n = c->n_in[PV], m = c->n_in[OPERATE];
+  if (!c->uses[FRESH]) return controller_step(c, given);
+  memcpy(l->told, c->fresh, n * sizeof *l->told);
+  memcpy(l->told + n, c->operate, m * sizeof *l->told);
+  for (size_t k = 0; k < n; k++) {
+    if (l->bad[k]) c->fresh[k] = 0;
+    if (l->shed[k]) c->operate[use_of(c, k)] = 0;
+  }
+  Outcome outcome = controller_step(c, given);
+  memcpy(c->fresh, l->told, n * sizeof *l->told);
+  memcpy(c->operate, l->told + n, m * sizeof *l->told);
+  return outcome;
+}
+
 static void loop_take(Loop *l, const Sample *sample) {
   Controller *c = l->c;
   size_t n = c->n_in[MV];
-  bool good_one = sample && trusted(c, sample);
+  bool apart = c->uses[FRESH], good_one = sample && trusted(c, sample, apart ? l->bad : NULL);
+  if (!good_one) loop_missed(l, 1);
+  else if (apart) good_one = loop_bridge(l, sample->pv);
   if (sample) loop_found(l, sample->mv_applied, good_one);
   memcpy(l->before, l->mv, n * sizeof *l->mv);
   if (!good_one) {
@@ -832,8 +929,8 @@ static void loop_take(Loop *l, const Sample *sample) {
   }
   clip(c, sample->mv_applied ? sample->mv_applied : l->mv, l->applied);
   if (!loop_writes(l)) memcpy(l->mv, l->applied, n * sizeof *l->mv);
-  const double *const given[STATE] = {[SP] = l->sp, [PV] = sample->pv, [DV] = sample->dv, [MV] = l->applied};
-  if (controller_step(c, given) != STEPPED) {
+  const double *const given[STATE] = {[SP] = l->sp, [PV] = apart ? l->pv : sample->pv, [DV] = sample->dv, [MV] = l->applied};
+  if (loop_step(l, given) != STEPPED) {
     if (l->mode == AUTO) memcpy(l->mv, l->applied, n * sizeof *l->mv);
     loop_fault(l, c->words);
     return;
