@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from math import inf, isfinite
 from os import PathLike
 from pathlib import Path
@@ -93,8 +91,6 @@ class Controller:
     A step holds a lock, because its buffers are bound to the session once and used by every step. A fork of the process
     waits for a step that is under way, so that the child finds buffers, session and lock as between two steps.
     """
-
-    _operate: Operate | None  # of a law that reads operate or fresh
 
     def __init__(self, path: str | PathLike[str], sha256: str | None = None) -> None:
         self.path = Path(path)
@@ -213,18 +209,6 @@ class Controller:
     def width(self) -> int:
         """Numbers of a row that ``compute`` takes."""
         return len(self._in)
-
-    def change_defaults(self, values: Mapping[str, float]) -> None:
-        """From now on these values of ``operate``, by name, are its defaults, in ``manifest`` too.
-
-        For a simulation of what operators have changed; on a plant the loop says the values of each step. ContractError
-        for an unknown name or a value that is not allowed.
-        """
-        changed = Operate(self.manifest.operate).with_values(values)
-        pairs = zip(self.manifest.operate, changed.tolist(), strict=True)
-        entries = tuple(replace(entry, default=value) for entry, value in pairs)
-        self.manifest = replace(self.manifest, operate=entries)
-        self._operate = None if self._operate is None else Operate(entries)
 
     def warm(self) -> None:
         """Two discarded steps on the last inputs: just before a deadline they bring code and weights into the caches.

@@ -68,7 +68,7 @@ def run(options: argparse.Namespace) -> None:
     case = _case_of(manifest)
     drawing = Drawing(case, options.seed, options.spread / 100, options.faults / 100)
     operate = {event.name: event.value for event in options.operate}
-    Operate(manifest.operate).with_values(operate)  # told before any work
+    Operate(manifest.operate).with_values(operate)  # an error comes before any work
     stress = Stress(drawing, content, tuple(operate.items()))
     for tests in drawing.tests.values():
         for test in tests:

@@ -182,8 +182,8 @@ def _gone(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
     good = yield KitScan("a PV is bad after missed periods", _with(good, "pv", 0, nan), missed=bridged)
     good = yield KitScan("a PV is bad after missed periods", _with(good, "pv", 0, nan))
     for k in range(bridged + LONGER):
-        bad = replace(good, pv=np.full(len(m.pv), nan))
-        good = yield KitScan(f"all PVs are bad for {k + 1} scans", bad)
+        none = replace(good, pv=np.full(len(m.pv), nan))
+        good = yield KitScan(f"all PVs are bad for {k + 1} scans", none)
     for _ in range(KIT_RECOVERY + 2):
         good = yield KitScan("after all PVs were bad", good)
 

@@ -134,7 +134,12 @@ def step_by_step(stress: Stress, draw: Draw) -> tuple[np.ndarray, np.ndarray]:
         pvs.append(plant.measured(x)[0])
         try:
             mv, state, _ = controller.step(
-                sp=test.sp[k], pv=pvs[-1] + noise[k], dv=dv[k], mv_applied=applied, state=state
+                sp=test.sp[k],
+                pv=pvs[-1] + noise[k],
+                dv=dv[k],
+                mv_applied=applied,
+                state=state,
+                operate=stress.operated,
             )
         except LoopwrightError:
             mv, state = applied, controller.cold_state()

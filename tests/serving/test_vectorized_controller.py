@@ -60,18 +60,3 @@ def test_a_row_that_is_not_allowed_is_named(operated_file: Path) -> None:
     ):
         with pytest.raises(ContractError, match=words):
             many.step(**begin, **extra)
-
-
-def test_other_defaults_hold_where_nothing_is_given(operated_file: Path) -> None:
-    changed, file = Controller(operated_file), Controller(operated_file)
-    changed.change_defaults({"u0.high": 0.1, "u0.low": -0.1})
-    assert Operate(changed.manifest.operate).default.tolist() != Operate(file.manifest.operate).default.tolist()
-    begin = {**{n: v[0] for n, v in given(0).items()}, "mv_applied": [0.0, 0.0], "state": file.cold_state()}
-    begin["sp"] = np.array([2.0, 2.0])
-    values = Operate(file.manifest.operate).with_values({"u0.high": 0.1, "u0.low": -0.1})
-    ours, theirs = changed.step(**begin), file.step(**begin, operate=values)
-    assert bytes(ours.mv) == bytes(theirs.mv) != bytes(file.step(**begin).mv)
-    with pytest.raises(ContractError, match=r"u0\.high is 3; allowed is -1 to 1 V"):
-        changed.change_defaults({"u0.high": 3.0})
-    with pytest.raises(ContractError, match="operate has no entry 'u0'"):
-        changed.change_defaults({"u0": 0.0})
