@@ -167,21 +167,21 @@ def _scans(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
         yield from _gone(m, good)
 
 
-LONGER = 3  # scans for which readings stay bad after they were bridged
+STAYS_BAD = 3  # scans for which readings stay bad after they were bridged
 
 
 def _gone(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
     """Readings that are bad for longer than they are bridged: of each PV alone, over a gap, and of all together."""
     bridged = round(BRIDGE_PERIODS)
     for i, s in enumerate(m.pv):
-        for k in range(bridged + LONGER):
+        for k in range(bridged + STAYS_BAD):
             bad = nan if k % 2 else s.high + (s.high - s.low)
             good = yield KitScan(f"PV {s.name} is bad for {k + 1} scans", _with(good, "pv", i, bad))
         for _ in range(KIT_RECOVERY + 1):
             good = yield KitScan(f"after PV {s.name} was bad", good)
     good = yield KitScan("a PV is bad after missed periods", _with(good, "pv", 0, nan), missed=bridged)
     good = yield KitScan("a PV is bad after missed periods", _with(good, "pv", 0, nan))
-    for k in range(bridged + LONGER):
+    for k in range(bridged + STAYS_BAD):
         none = replace(good, pv=np.full(len(m.pv), nan))
         good = yield KitScan(f"all PVs are bad for {k + 1} scans", none)
     for _ in range(KIT_RECOVERY + 2):

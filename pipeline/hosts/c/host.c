@@ -673,8 +673,8 @@ typedef struct {
   bool lost;      /* the last command did not reach the plant, and nothing has told since where the MV stands */
   double max_gap; /* missed periods in a row after which the law starts cold */
   double *sp, *mv, *applied, *before; /* mv is NAN while nobody knows where it stands */
-  /* Of a law that reads fresh, by PV: the last good number, periods since then, whether it is bad, predicted, or left
-     out of what the law controls now, and whether the loop holds rather than leave it out. */
+  /* By PV, for a law that reads fresh: the last good number, periods since then, whether it is bad, predicted, or left
+     out of what the law controls now, and whether the loop holds rather than leave it out (set it yourself). */
   double *last, *gone;
   bool *bad, *bridged, *shed, *critical;
   double bridge_s; /* for so long a bad reading is predicted */
