@@ -253,8 +253,8 @@ def _course(signals: Sequence[Signal], rng: np.random.Generator, jumps: float | 
 
 
 OPERATED = 1 / 25  # probability a step that an operator changes something
-USED = 0.85  # of switches that are on
-STALE = 0.1  # of readings that are not fresh
+SWITCHED_ON = 0.85  # of switches that are on
+NOT_FRESH = 0.1  # of readings that are not fresh
 
 
 def _operated(operate: Operate, rng: np.random.Generator) -> Callable[[], Array]:
@@ -267,18 +267,18 @@ def _operated(operate: Operate, rng: np.random.Generator) -> Callable[[], Array]
             at = np.array([rng.uniform(e.low, e.high) for e in operate.entries])
             for i, e in enumerate(operate.entries):
                 if e.what in SWITCHES:
-                    at[i] = float(rng.uniform() < USED) * e.high
+                    at[i] = float(rng.uniform() < SWITCHED_ON) * e.high
                 elif e.what == "rank":
                     at[i] = round(at[i])
-                elif e.what == "high":  # stands behind its low end
-                    at[i - 1], at[i] = sorted(at[i - 1 : i + 1])
+                elif e.what == "high" and (low := operate.places.get(f"{e.signal}.low")) is not None:
+                    at[[low, i]] = sorted(at[[low, i]])
         return at
 
     return step
 
 
 def _freshness(n: int, rng: np.random.Generator) -> Callable[[], Array]:
-    return lambda: (rng.uniform(size=n) > STALE).astype(np.float64)
+    return lambda: (rng.uniform(size=n) > NOT_FRESH).astype(np.float64)
 
 
 def _check_shapes(law: ControlLaw) -> None:

@@ -101,7 +101,8 @@ def station_that(did: list[str], write: Callable[..., object]) -> Station:
     controller = Controller(FILE)
     monitor = Monitor(controller.manifest, started_s=1e9)
     return cast(Station, SimpleNamespace(
-        loop=SimpleNamespace(controller=controller, successor=None, replaced=None), _moved=lambda loop: None,
+        loop=SimpleNamespace(controller=controller, successor=None, replaced=None, operate=()),
+        _moved=lambda loop: None,
         scans=0, _faults=0, _missed_periods=0, _watchers=[lambda *_: did.append("others")], snapshot=None,
         recorder=SimpleNamespace(controller=controller, scan=write),
         watching=SimpleNamespace(seen=lambda *_: did.append("monitor"), monitor=monitor),

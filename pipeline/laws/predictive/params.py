@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Literal
@@ -39,8 +40,9 @@ class PredictiveParams:
     for each MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
     none; None: no limits. A set point beyond a limit counts as one at the limit. ``preview`` of the set points:
     ``held``, as they are now; ``ramp``, their last slope goes on, as in a recipe of ramps; steps to come are not known.
-    ``operate``: the law reads what operators change while it runs, and which readings are fresh; ``cv_low`` and
-    ``cv_high`` are then the ranges' defaults.
+    ``operate``: the law reads what operators change while it runs, and which readings are fresh. It maps entries such
+    as ``TIC-1.low`` or ``valve.rest`` to other defaults than those of ``entries_of``, and may be empty; None: the law
+    has none of this. ``cv_low`` and ``cv_high`` are then the ranges' defaults.
     """
 
     speed: float = 1.0
@@ -63,7 +65,7 @@ class PredictiveParams:
     cv_low: Limits = None
     cv_high: Limits = None
     preview: Literal["held", "ramp"] = "held"
-    operate: bool = False
+    operate: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ("speed", "caution", "jumps", "move_weight", "eps", "q_x", "q_d"):

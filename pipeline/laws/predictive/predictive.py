@@ -103,15 +103,15 @@ class Predictive(ControlLaw):
         self.observer = Observer(model, loads, Noises(params.q_x, self.q_d / params.caution**2, params.jumps))
         rate = None if self.rate is None else self.rate / half
         # With `operate` further PVs that the model has as outputs have ranges, too.
-        n_o = model.n_y if params.operate else n_cv
+        n_o = n_cv if params.operate is None else model.n_y
         run = horizon_of(model, loads, self.moves, mv_of, n_o)
-        bounds = None if params.operate else self._bounds(model, params)
+        bounds = self._bounds(model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
-        self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls)
+        self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls, valleys=n_mv > n_cv)
         self.wanted = self._set_points(model, bounds, n_o, ramp=params.preview == "ramp")
         self.operation = None
-        if params.operate:
+        if params.operate is not None:
             self._build_operation(model, params, n_o, max(weights), middle, half)
         at_mvs = loads.into_v[:n_mv].diagonal() * model.v_scale[:n_mv] if loads.at_mvs else model.y_scale[:n_cv]
         self.register_buffer("load_scale", at_mvs.clone())
@@ -150,7 +150,7 @@ class Predictive(ControlLaw):
         """The entries of ``operate``, their defaults, and the way from them to a plan."""
         low, high = (getattr(params, end) or (None,) * len(self.signals.sp) for end in ("cv_low", "cv_high"))
         limits_of(self.signals, params)  # raises
-        self.operate = entries_of(self.signals, n_o, low, high)
+        self.operate = entries_of(self.signals, n_o, low, high, params.operate or {})
         scales = OperateScales(model.y_center[:n_o], model.y_scale[:n_o], middle, half)
         self.operation = Operation(self.operate, scales, self.moves, most_weight)
         default = torch.tensor([entry.default for entry in self.operate], dtype=torch.float64)
@@ -235,7 +235,7 @@ class Predictive(ControlLaw):
 
         Its set points step over the record's range, so it knows no soft limits and no recipe.
         """
-        horizon, plain = self.moves.horizon, replace(params, cv_low=None, cv_high=None, preview="held", operate=False)
+        horizon, plain = self.moves.horizon, replace(params, cv_low=None, cv_high=None, preview="held", operate=None)
 
         def law_of(n: Mapping[str, float], damping: float | None, given: PredictiveParams = plain) -> Any:
             numbers: dict[str, Any] = {**n, "horizon": int(n["horizon"]), "damping": damping}
@@ -304,7 +304,8 @@ class Predictive(ControlLaw):
             share = self.operation.load_share(given.unsqueeze(-2))
             mean, boost, estimate, plan = self._estimated(now, kept, seen, share)
             variance = estimate[..., mean.shape[-1] :].index_select(-1, self.variances)
-            operated = self.operation(given.unsqueeze(-2), applied, torch.sqrt(torch.clamp(variance, min=0.0)))
+            stands = applied.repeat(*(1 for _ in applied.shape[:-1]), len(self.moves.starts))
+            operated = self.operation(given.unsqueeze(-2), stands, torch.sqrt(torch.clamp(variance, min=0.0)))
         else:
             mean, boost, estimate, plan = self._estimated(now, kept)
         measured = now["v"][..., now["z"].shape[-1] :]
@@ -316,9 +317,8 @@ class Predictive(ControlLaw):
         plan, ahead = self.planner(start, wanted, applied, plan, operated)
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)
         if operated is not None:
-            used, most = operated.mv_use.squeeze(-2), operated.mv_move.squeeze(-2)
+            most = operated.mv_move.squeeze(-2)
             mv = torch.minimum(torch.maximum(mv, mv_applied - most), mv_applied + most)
-            mv = used * mv + (1 - used) * mv_applied
         info = [
             self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],
             self.y_center + self.y_scale * ahead[..., :n_cv],

@@ -54,6 +54,11 @@ class SetPointCourse(nn.Module):
         return values.repeat(*(1 for _ in values.shape[:-1]), self.horizon)
 
 
+LEAST_HALF = 1e-9  # of half an MV's range: a narrower one is a point
+LEAST_BEND = 1e-30  # of a cost along a direction: nothing moves
+MOST_LENGTH = 1e3  # sweeps that one step along a valley stands for
+AT_BOUND = 1e-9  # scaled: an entry this near a bound that does not move holds nothing back
+
 # --------------------------------------------------------------------------------------------------------- soft limits
 PRICE = 30.0  # of a scaled unit beyond a limit, in units of the largest weight of an error
 EPS = 0.03  # scaled: what lies beyond a limit by less counts by its square
@@ -67,26 +72,26 @@ class LimitCost(NamedTuple):
     slope: Tensor  # (..., 1, N n_cv)
 
 
-class Operated(NamedTuple):
-    """What operators ask of a plan, scaled; of outputs (..., 1, N n_o), of a plan's moves (..., 1, m)."""
+class OperatedPlan(NamedTuple):
+    """Wishes of the operators for a plan, scaled: of outputs (..., 1, N n_o), of a plan's moves (..., 1, m)."""
 
     track: Tensor  # 1 where a set point is followed, 0 elsewhere
-    use: Tensor  # 1 where a CV is in use
     low: Tensor  # of the outputs' ranges
     high: Tensor
     low_inside: Tensor  # where the price of leaving it begins
     high_inside: Tensor
     price: Tensor  # of what lies beyond a range; 0 out of use
     y_cost: Tensor  # slope of the cost over the outputs
+    stands: Tensor  # the applied MV at every move
     z_low: Tensor  # of the moves
     z_high: Tensor
-    rate: Tensor  # largest difference from the move before
+    rate: Tensor  # largest difference from the move before; 0 out of use
+    reach: Tensor  # largest difference from the applied MV: as far as the rate brings it until then; 0 out of use
     rest: Tensor  # of the moves
     rest_weight: Tensor  # curvature of the cost of being away from it
     z_cost: Tensor  # slope of the cost over the moves
     stiffness: Tensor  # (..., 1, 1) of the moves' cost over the designed one
-    mv_use: Tensor  # (..., 1, n_mv)
-    mv_move: Tensor  # (..., 1, n_mv) [mv] a period
+    mv_move: Tensor  # (..., 1, n_mv) [mv] a period; 0 of an MV out of use
 
 
 def limit_cost(y: Tensor, low: Tensor, high: Tensor, price: Tensor, soft: Tensor, eps_squared: Tensor) -> LimitCost:
@@ -172,8 +177,10 @@ class Planner(nn.Module):
     eye: Tensor  # (m, m)
     stiff: Tensor  # (m, m) ones, and 1 + kappa on the diagonal
     damping: Tensor  # (1,) kappa
+    apart: Tensor  # (m, m) ones, and 0 on the diagonal
     soft: Tensor  # (1,) of the price of a range
     soft_squared: Tensor  # (1,)
+    near: Tensor  # (1,) to a bound
 
     def __init__(
         self,
@@ -184,8 +191,11 @@ class Planner(nn.Module):
         sweeps: int,
         rate: Tensor | None = None,
         limits: SoftLimits | None = None,
+        *,
+        valleys: bool = False,
     ) -> None:
         super().__init__()
+        self.valleys = valleys  # more MVs than set points: a step along the cost's flat directions beside the sweeps
         self.limits = limits
         self.horizon, self.passes, self.sweeps, self.m = horizon, passes, sweeps, moves.count
         self.n_cv = len(cost.weights)
@@ -199,14 +209,15 @@ class Planner(nn.Module):
             "columns": eye.unsqueeze(-2).repeat(1, self.m, 1),
             "eye": eye,
             "stiff": 1.0 + cost.damping * eye,
+            "apart": 1.0 - eye,
         }
         for name, values in buffers.items():
             self.register_buffer(name, values)
         hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2, damping=cost.damping)
-        hold_numbers(self, soft=SOFT, soft_squared=EPS**2)
+        hold_numbers(self, soft=SOFT, soft_squared=EPS**2, near=AT_BOUND)
 
     def forward(
-        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, operated: Operated | None = None
+        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, operated: OperatedPlan | None = None
     ) -> tuple[Tensor, Tensor]:
         """The plan (..., 1, m), and the outputs (..., 1, n_cv) that it gives at the next sample.
 
@@ -235,7 +246,7 @@ class Planner(nn.Module):
         return plan, ahead
 
     def _operated(
-        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, by: Operated
+        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, by: OperatedPlan
     ) -> tuple[Tensor, Tensor]:
         """The plan that is best with ranges, priorities, resting values and costs, within the operators' bounds.
 
@@ -249,21 +260,83 @@ class Planner(nn.Module):
         at = applied @ self.first
         held = by.stiffness * (applied @ self.applied) + by.rest_weight * by.rest - by.z_cost
         wanted, weights = torch.minimum(torch.maximum(wanted, by.low), by.high), self.weights * by.track
+        # What the operators allow, as far as the MV gets until then; of an MV out of use where it stands.
+        low, high = (
+            torch.minimum(torch.maximum(end, by.stands - by.reach), by.stands + by.reach)
+            for end in (by.z_low, by.z_high)
+        )
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
         for _ in range(self.passes):
             run = self.horizon(start, plan)
             error = run.y - wanted
             weight = weights / torch.sqrt(error * error + self.eps_squared)
             push = limit_cost(run.y, by.low_inside, by.high_inside, by.price, self.soft, self.soft_squared)
             both = weight + push.weight
-            curvature = product(run.slopes * both, run.slopes_t, stiff)
             back = both * (plan @ run.slopes) - weight * error - push.slope - by.y_cost
             pull = product(back, run.slopes_t, held)
             before = plan
-            diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
-            pull = pull + self.damping * diagonal * plan
-            plan = self.descended(curvature * self.stiff, pull, plan, at, (by.z_low, by.z_high, by.rate))
+            curvature, pull = self._damped(run.slopes * both, run.slopes_t, stiff, pull, plan)
+            if self.rate is None:
+                plan = self._descended_within(curvature, pull, plan, middle, half)
+            else:
+                plan = self.descended(curvature, pull, plan, at, (low, high, by.rate))
         ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
         return plan, ahead
+
+    def _damped(
+        self, weighed: Tensor, slopes_t: Tensor, stiff: Tensor, pull: Tensor, plan: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Curvature (..., m, m) and pull of a pass; a step away from ``plan`` costs kappa of the outputs' curvature.
+
+        With as many MVs as set points it is its diagonal, as without ``operate``. With more, all of it: MVs may move
+        together freely as far as no output shows it.
+        """
+        if not self.valleys:
+            curvature = product(weighed, slopes_t, stiff)
+            diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
+            return curvature * self.stiff, pull + self.damping * diagonal * plan
+        seen = self.damping * (weighed @ slopes_t)
+        return product(weighed, slopes_t, stiff) + seen, pull + plan @ seen
+
+    def _along_valley(
+        self, curvature: Tensor, pull: Tensor, plan: Tensor, half: Tensor, t: Tensor, moved: Tensor
+    ) -> Tensor:
+        """The step (..., 1, m) on in the direction that a sweep ``moved`` t: to the least cost, or the nearest bound.
+
+        Where there are more MVs than set points, the cost is flat along the MVs' common moves that no output shows, and
+        sweeps go that way by a few percent each. The least cost along s is at a = (pull - H z) s'/(s H s').
+        """
+        along = half * moved
+        down = ((pull - plan @ curvature) * along).sum(dim=-1, keepdim=True)
+        bend = ((along @ curvature) * along).sum(dim=-1, keepdim=True)
+        length = torch.clamp(down / torch.clamp(bend, min=LEAST_BEND), 0.0, MOST_LENGTH)
+        room = 1.0 - t * torch.sign(moved) + self.near
+        free = (room / torch.clamp(moved.abs(), min=AT_BOUND / MOST_LENGTH)).amin(dim=-1, keepdim=True)
+        return torch.minimum(length, free) * moved
+
+    def _descended_within(self, curvature: Tensor, pull: Tensor, plan: Tensor, middle: Tensor, half: Tensor) -> Tensor:
+        """The minimum of z'Hz/2 - pull z for z = middle + half t, |t| <= 1, from ``plan``; bounds (..., 1, m).
+
+        In t the bounds are numbers, so that a coordinate takes two operators, as without operators' limits.
+        """
+        m = self.m
+        size = torch.clamp(half, min=LEAST_HALF)
+        diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
+        share = curvature / (diagonal * size)  # column p over what makes t_p of it
+        rows = (half * self.eye).sum(dim=-1, keepdim=True)  # half as a column
+        others = rows * share * self.apart
+        g = self.eye - (others + self.eye).unsqueeze(-3) * self.columns
+        c = self.eye * (pull / (diagonal * size) - middle @ share)
+        into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
+        add = torch.split(c, 1, dim=-2)
+        t = (plan - middle) / size
+        for sweep in range(self.sweeps):
+            before = t
+            for p in range(m):
+                t = hardtanh(product(t, into[p], add[p]))
+            if self.valleys and sweep == self.sweeps - 2:
+                t = hardtanh(t + self._along_valley(curvature, pull, middle + half * t, half, t, t - before))
+        return middle + half * t
 
     def descended(
         self,
@@ -292,12 +365,18 @@ class Planner(nn.Module):
                 for p in range(m):
                     plan = hardtanh(product(plan, into[p], add[p]))
                 continue
-            middle = product(plan, self.before, at)
-            if bounds is None:
-                low, high = (torch.clamp(end, -1.0, 1.0) for end in (middle - self.rate, middle + self.rate))
-            else:
-                least, most, rate = bounds
-                low, high = (torch.minimum(torch.maximum(end, least), most) for end in (middle - rate, middle + rate))
+            low, high = self._ends(product(plan, self.before, at), bounds)
             for p in range(m):
                 plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
         return plan
+
+    def _ends(self, middle: Tensor, bounds: tuple[Tensor, Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
+        """The ends of each move, whose move before is at ``middle`` (..., 1, m); ``bounds`` as in ``descended``."""
+        if bounds is not None:
+            least, most, rate = bounds
+            return (
+                torch.minimum(torch.maximum(middle - rate, least), most),
+                torch.minimum(torch.maximum(middle + rate, least), most),
+            )
+        assert self.rate is not None  # without a rate the ends are numbers
+        return torch.clamp(middle - self.rate, -1.0, 1.0), torch.clamp(middle + self.rate, -1.0, 1.0)
