@@ -18,5 +18,5 @@ from loopwright.pipeline.export.gate import export
 def operated_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two controlled variables, two MVs, one measured disturbance; a horizon that a test can wait for."""
     path = tmp_path_factory.mktemp("controller") / "operated.onnx"
-    export(law_of(random_model(3, n_y=2, n_mv=2, n_dv=1), horizon=20, operate=True), path, case="made", provenance={})
+    export(law_of(random_model(3, n_y=2, n_mv=2, n_dv=1), horizon=20, operate={}), path, case="made", provenance={})
     return path

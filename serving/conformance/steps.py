@@ -29,7 +29,7 @@ NUDGE = 1e-12  # share of an entry of the state by which a run beside the chain 
 AT_AN_END = 0.1  # share of the values drawn anywhere that lie at an end of the range
 STEERED = 0.5  # share of the entries of `operate` that are not the default: at all others a loop would hardly move
 STEERED_ANEW = 0.1  # probability a step of a course that operators change something
-NOT_FRESH = 0.2  # share of the readings that are not fresh
+UNFRESH = 0.2  # share of the readings that are not fresh
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +188,7 @@ class _Steering:
             self.at = np.array(self.manifest.usual("operate"))
         elif given.part in WITHOUT_PAST or self.rng.uniform() < STEERED_ANEW:
             self.at = self._drawn()
-        fresh = (self.rng.uniform(size=len(self.manifest.pv)) >= NOT_FRESH).astype(np.float64)
+        fresh = (self.rng.uniform(size=len(self.manifest.pv)) >= UNFRESH).astype(np.float64)
         values = {"operate": self.at, "fresh": fresh}
         return replace(given, inputs=given.inputs | {n: v for n, v in values.items() if n in self.manifest.inputs})
 

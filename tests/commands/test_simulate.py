@@ -81,7 +81,7 @@ def test_a_scenario_is_the_one_that_validation_runs(pid_file: Path, plant: Equat
 def steered_file(plant: EquationPlant, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A predictive law of the case that reads what operators change."""
     path, model = tmp_path_factory.mktemp("controllers") / "steered.onnx", parts(plant)["identified"]
-    law = Predictive(plant.signals, model, Predictive.Params(horizon=20, operate=True)).eval()
+    law = Predictive(plant.signals, model, Predictive.Params(horizon=20, operate={})).eval()
     export(law, path, case=CASE, provenance={})
     return path
 

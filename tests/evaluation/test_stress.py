@@ -164,7 +164,7 @@ def test_loops_have_the_operate_that_is_asked_for(tmp_path: Path, monkeypatch: p
     monkeypatch.chdir(tmp_path)
     case = controllers_of_a_lag({})
     (mv,) = case.plant.mv_signals
-    law = Predictive(case.plant.signals, first_order(0.6), Predictive.Params(horizon=20, operate=True)).eval()
+    law = Predictive(case.plant.signals, first_order(0.6), Predictive.Params(horizon=20, operate={})).eval()
     export(law, tmp_path / "it.onnx", case="it", provenance={})
     drawing, content, middle = Drawing(case, faults=0.0), (tmp_path / "it.onnx").read_bytes(), mv.middle
     limited = Stress(drawing, content, ((f"{mv.name}.high", middle), (f"{mv.name}.low", middle - 0.1)))

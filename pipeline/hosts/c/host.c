@@ -863,9 +863,9 @@ static size_t use_of(const Controller *c, size_t pv) {
   return i < c->n_in[OPERATE] && c->operate_entries[i].of_cv ? i : c->n_in[OPERATE];
 }
 
-/* Which PVs with bad readings are predicted and which are left out, and the numbers for the law in l->pv. A law that
-   reads fresh goes on without a PV whose reading is bad: for bridge_s it predicts the PV, then its use is 0 until the
-   reading is good again. False where no PV is left that is in use, where one is gone for longer that is critical or has
+/* Judge PVs with bad readings, predicted or left out, and put the numbers for the law into l->pv. A law that reads fresh
+   goes on without a PV whose reading is bad: for bridge_s it predicts the PV, then its use is 0 until the reading is
+   good again. False where no PV is left that is in use, where one is gone for longer that is critical or has
    no use, and where one was never read. */
 static bool loop_bridge(Loop *l, const double *pv) {
   Controller *c = l->c;
