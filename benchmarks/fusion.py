@@ -89,11 +89,11 @@ class Bound:
 
 
 def drawn(manifest: Manifest, steps: int) -> Iterator[dict[str, Array]]:
-    """Inputs but the state, uniform over their ranges."""
+    """Inputs but the state, uniform over their ranges; `operate` by default, and all readings fresh."""
     rng = np.random.default_rng(0)
     for _ in range(steps):
         yield {
-            name: np.array([rng.uniform(s.low, s.high) for s in manifest.signals(name)])
+            name: np.array([rng.uniform(s.low, s.high) for s in manifest.signals(name)] or manifest.usual(name))
             for name in manifest.inputs
             if name != "state"
         }

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.loop import WARM_LEAD_S
-from loopwright.serving.manifest import Signal
+from loopwright.serving.manifest import SWITCHES, OperateEntry, Signal
 from loopwright.serving.trust import ending, judged, signer
 from loopwright.serving.words import plain
 
@@ -52,6 +52,7 @@ def card(controller: Controller) -> str:
         idle = " (this law does not take them)" * (name == "dv" and "dv" not in m.inputs)
         lines += _signals(title + idle, m.signals(name))
     lines += _signals("manipulated variables", m.mv)
+    lines += _operate(m.operate if "operate" in m.inputs else ())
     outputs = ["mv"] + ["state_next"] * bool(m.n_state) + ["info"] * bool(m.info)
     lines += ["", f"inputs      {', '.join(m.inputs)}", f"outputs     {', '.join(outputs)}"]
     lines += [f"state       {m.n_state} numbers, all zero: no past", f"info        {', '.join(m.info) or '-'}"]
@@ -81,6 +82,19 @@ def _signals(title: str, signals: tuple[Signal, ...]) -> list[str]:
         moves = "" if s.max_move is None else f", moves at most {s.max_move:g}{unit} a period"
         rows.append(f"  {s.name:<{width}}  {allowed}{unit}{moves}")
     return ["", title, *rows]
+
+
+def _operate(entries: tuple[OperateEntry, ...]) -> list[str]:
+    """A table of what operators may change: name, default, engineered range, unit."""
+    if not entries:
+        return []
+    rows = [("name", "default", "allowed", "unit")]
+    for e in entries:
+        switched = e.what in SWITCHES and e.low < e.high
+        rows.append((e.name, f"{e.default:g}", "0 or 1" if switched else f"{e.low:g} .. {e.high:g}", e.unit))
+    name, default, allowed, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
+    lines = [f"  {n:<{name}}  {d:>{default}}  {a:<{allowed}}  {u}".rstrip() for n, d, a, u in rows]
+    return ["", "what operators may change (operate)", *lines]
 
 
 def _locked_up(evidence: dict[str, Any]) -> list[str]:

@@ -113,6 +113,8 @@ def _ending(status: int) -> str:
 def take(loaded: controller.Controller) -> None:
     """The first steps: the middle of every range, then both ends of each kind of input, a few in a row from no past.
 
+    A law that reads ``operate`` and ``fresh`` is also stepped with all its entries low, all high, and nothing fresh.
+
     Raises ArtifactError where onnxruntime cannot compute one, or where no step at all gives an MV. A law may refuse
     some of these inputs: in a loop that is a fault, which no process dies of.
     """
@@ -140,6 +142,12 @@ def _inputs(m: Manifest) -> Iterator[dict[str, np.ndarray]]:
             name: np.array([s.high if end else s.low for s in m.signals(name)], dtype=np.float64)
             for name, end in zip(names, ends, strict=True)
         }
+    middle = {name: np.array(m.usual(name)) for name in names}
+    if "operate" in m.inputs:  # both ends of a range are then one value, which is allowed
+        for end in ("low", "high"):
+            yield middle | {"operate": np.array([getattr(entry, end) for entry in m.operate])}
+    if "fresh" in m.inputs:
+        yield middle | {"fresh": np.zeros(len(m.pv))}
 
 
 def main(path: str, sha256: str | None = None) -> int:

@@ -67,7 +67,8 @@ class Operate:
         if not good.all():
             i = int(np.argmin(good))
             e = self.entries[i]
-            allowed = "0 or 1" if self._switches[i] else f"{e.low:g} to {e.high:g} {e.unit}".rstrip()
+            switched = self._switches[i] and e.low < e.high
+            allowed = "0 or 1" if switched else f"{e.low:g} to {e.high:g} {e.unit}".rstrip()
             raise ContractError(f"operate: {e.name} is {given[i]:g}; allowed is {allowed}")
         crossed = given[self._pairs[:, 0]] > given[self._pairs[:, 1]]
         if crossed.any():
@@ -77,3 +78,9 @@ class Operate:
                 f"{given[high]:g}; a low end must not be above the high one"
             )
         return given
+
+    def ordered(self, values: ArrayLike) -> Array:
+        """``values`` (n,) with the ends of a range exchanged where the low one is above the high one."""
+        found = np.array(values, dtype=np.float64)
+        found[self._pairs] = np.sort(found[self._pairs], axis=-1)
+        return found

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from loopwright.serving.controller import Array, Controller
 from loopwright.serving.errors import ContractError
+from loopwright.serving.operating import Operate
+
+STEERING = frozenset({"operate", "fresh"})  # inputs with defaults
 
 
 class VectorizedStep(NamedTuple):
@@ -33,25 +36,42 @@ class VectorizedController:
         self._mv, self._next = places.pop("mv"), places.pop("state_next")
         self._places = places
         self._given = np.zeros((n, controller.width))
-        for name in {"operate", "fresh"} & set(places):  # as they are by default
-            self._given[:, self._places.pop(name)] = controller.manifest.usual(name)
+        self._operate = Operate(controller.manifest.operate)
+        usual = {name: np.array(controller.manifest.usual(name)) for name in STEERING}
+        self._defaults: dict[str, Array] = {name: np.tile(values, (n, 1)) for name, values in usual.items()}
 
     def cold_state(self) -> Array:
         """States of zeros, shape (n, n_state): no past."""
         return np.zeros((self.n, self.controller.manifest.n_state))
 
-    def step(self, *, sp: Array, pv: Array, dv: Array, mv_applied: Array, state: Array) -> VectorizedStep:
+    def step(
+        self,
+        *,
+        sp: Array,
+        pv: Array,
+        dv: Array,
+        mv_applied: Array,
+        state: Array,
+        operate: Array | None = None,
+        fresh: Array | None = None,
+    ) -> VectorizedStep:
         """One step of each row; all inputs (n, ...), in engineering units. An input that the law has not is ignored.
 
-        Raises ContractError for an input of another shape. A row with an input that is not finite, or whose output is
-        not finite, outside the MV's range or further from ``mv_applied`` than the MV moves in a period, is marked as
-        refused.
+        ``operate`` (n, n_operate) as the manifest's ``operate`` lists it, None: its defaults; ``fresh`` (n, n_pv), 1
+        for a new and good reading, else 0, None: all are.
+
+        Raises ContractError for an input of another shape, and for a value of ``operate`` or ``fresh`` that is not
+        allowed, with its row. A row with an input that is not finite, or whose output is not finite, outside the MV's
+        range or further from ``mv_applied`` than the MV moves in a period, is marked as refused.
         """
         given = {"sp": sp, "pv": pv, "dv": dv, "mv_applied": mv_applied, "state": state}
+        given |= {"operate": self._steering("operate", operate), "fresh": self._steering("fresh", fresh)}
         for name, place in self._places.items():
             wanted = (self.n, place.stop - place.start)
             if given[name].shape != wanted:
                 raise ContractError(f"{name} has the shape {given[name].shape}; {self.n} rows need {wanted}")
+            if name in STEERING:
+                self._require_allowed(name, given[name])
             self._given[:, place] = given[name]
         taken = self.controller.compute(self._given)
         mv = taken[:, self._mv].copy()
@@ -64,3 +84,23 @@ class VectorizedController:
                 pairs = zip(applied.tolist(), moved.tolist(), strict=True)
                 allowed &= np.array([signal.moves(before, after) for before, after in pairs])
         return VectorizedStep(mv, taken[:, self._next].copy(), np.logical_not(allowed))
+
+    def _steering(self, name: str, rows: Array | None) -> Array:
+        """``rows`` (n, ...), or the defaults in each."""
+        return self._defaults[name] if rows is None else np.asarray(rows, dtype=np.float64)
+
+    def _require_allowed(self, name: str, rows: Array) -> None:
+        """ContractError, with its number, for the first row (n, ...) that ``Controller.step`` would not take."""
+        if rows is self._defaults[name]:
+            return
+        if name == "fresh":
+            good = ((rows == 0) | (rows == 1)).all(axis=1)
+            if not good.all():
+                k = int(np.argmin(good))
+                raise ContractError(f"row {k}: fresh is {rows[k].tolist()}; each is 1 for a new and good reading, or 0")
+            return
+        for k in np.unique(rows, axis=0, return_index=True)[1].tolist():  # most rows have the same values
+            try:
+                self._operate.checked(rows[k])
+            except ContractError as error:
+                raise ContractError(f"row {k}: {error}") from error

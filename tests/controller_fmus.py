@@ -20,7 +20,7 @@ from loopwright.serving import Controller
 from loopwright.serving.conformance.steps import StepResult, answered
 
 Array = NDArray[np.float64]
-BOOLEAN = {"fault", "use_mv_applied"}
+BOOLEAN = {"fault", "use_mv_applied", "use_fresh"}
 MISSING = "" if shutil.which("cc") else "a C compiler is missing (apt install gcc)"
 
 

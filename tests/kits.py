@@ -137,6 +137,40 @@ def answers_refusals_and_disturbances(run: Run, file: Path, answers: Path) -> No
     assert verdict.identical, verdict.text()
 
 
+def takes_what_operators_change(run: Run, file: Path, answers: Path) -> None:
+    """No shipped law reads ``operate`` and ``fresh``; the one in ``file`` does (tests/operated_laws.py)."""
+    vectors = json.loads((kit_of(file) / VECTORS).read_text())
+    given = [row["given"] for row in vectors["steps"]]
+    assert len({tuple(row["operate"]) for row in given}) > 100
+    assert len({tuple(row["fresh"]) for row in given}) == 4
+    done = run("--conformance", kit_of(file), answers)
+    assert done.returncode == 0, done.stdout + done.stderr
+    verdict = verdict_on(file, answers)
+    assert verdict.identical, verdict.text()
+    copy = kit_of(file) / file.name
+    for u0, u1 in map(mvs_of, run(copy, "20", "0.02", "u0.high=0.2", "u0.low=-0.1", "u1.use=0").stdout.splitlines()):
+        assert -0.1 - ROUNDING <= u0 <= 0.2 + ROUNDING
+        assert u1 == 0  # where it stands
+    for words in NOT_ALLOWED:
+        done = run(copy, "1", "0.02", *words.split())
+        assert (done.returncode, done.stdout) == (2, ""), words
+        assert done.stderr.startswith("error: ")
+        assert done.stderr.count("\n") == 1
+
+
+ROUNDING = 1e-15  # of an operator's limit, which the law scales and scales back
+NOT_ALLOWED = (
+    "u0.high=2", "u0.use=0.5", "u0.low=0.5 u0.high=0.2", "y0.rank=9", "y0.rank=nan", "speed=0", "u9.use=0", "u0.low",
+)  # fmt: skip
+
+
+def mvs_of(line: str) -> tuple[float, float]:
+    """The two MVs of a line of a host's loop: scan, lateness, ms late, mode, MVs."""
+    words = line.replace(",", " ").split()
+    assert words[4] == "AUTO", line
+    return float(words[5]), float(words[6])
+
+
 def fails_on_a_damaged_kit(run: Run, damage: str, differences: str, folder: Path) -> None:
     """``differences``: the largest difference in one step and chained, and how many answers are wrong."""
     done = run("--conformance", spoilt(PID, folder, DAMAGES[damage]))

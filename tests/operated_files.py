@@ -55,4 +55,4 @@ def predictive_model() -> Any:
 @pytest.fixture(scope="session")
 def predictive(predictive_model: Any, tmp_path_factory: pytest.TempPathFactory) -> Controller:
     """The predictive law of ``predictive_model`` that reads both."""
-    return _exported(law_of(predictive_model, horizon=15, operate=True), tmp_path_factory.mktemp("predictive"))
+    return _exported(law_of(predictive_model, horizon=15, operate={}), tmp_path_factory.mktemp("predictive"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -55,6 +55,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         "PV=STD",
         "standard deviation of a reading's noise, of a measured disturbance too, over the whole run",
     )
+    events("--operate", "NAME=VALUE", "of what operators may change, another value than the file's default")
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip
     add("--duration", metavar="S", type=positive("s"), help="length of the run")
@@ -98,7 +99,8 @@ def run(options: argparse.Namespace) -> None:
             f"--scenario {others}"
         )
     title = f"{controller.manifest.law} on {plant.title}"
-    history = close_loop(controller, plant, course, title=title, speed=options.speed)
+    operate = {event.name: event.value for event in options.operate}
+    history = close_loop(controller, plant, course, title=title, speed=options.speed, operate=operate)
     print(summary(plant, history, METRICS["mae"] if case is None else case.criterion))
     picture = options.picture or Path(f"{controller.manifest.law}-simulation.png")
     draw(picture, plant, history, title, course.marks)
@@ -109,9 +111,18 @@ def run(options: argparse.Namespace) -> None:
 
 
 def close_loop(
-    controller: Controller, plant: Simulator, course: Timetable, *, title: str, speed: float | None = None
+    controller: Controller,
+    plant: Simulator,
+    course: Timetable,
+    *,
+    title: str,
+    speed: float | None = None,
+    operate: Mapping[str, float] | None = None,
 ) -> History:
-    """Run the controller's ControlLoop over the plant and show it; ``speed`` None is as fast as possible."""
+    """Run the controller's ControlLoop over the plant and show it; ``speed`` None is as fast as possible.
+
+    ``operate`` are values that operators have changed, by name; LoopError for a wrong one.
+    """
     simulated, history = SimulatedPlant(plant, course), History()
     # The loop outlives whatever raises, as a plant needs it to; a simulation that raised is over.
     failed: list[Exception] = []
@@ -137,6 +148,7 @@ def close_loop(
         recover_after=LIVE_RECOVERY,
         clock=VirtualClock() if speed is None else MonotonicClock(speed),
         warm_lead_s=0.0 if speed is None else WARM_LEAD_S * speed,
+        operate=operate,
     )
     period, n = plant.period_s, len(course.sp)
     marks = {round(at / period): text for at, text in course.marks.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 import time
 from pathlib import Path
 
@@ -23,11 +24,14 @@ from loopwright.pipeline.pictures.drawing import save
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.stress_pictures import loop_canvas
 from loopwright.pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
+from loopwright.pipeline.simulation.timetable import TimedValue, parse_event
 from loopwright.serving.manifest import Manifest
+from loopwright.serving.operating import Operate
 
 # Loops, their seed, spread and faults [%], and loops of a piece of work.
 STRESS_PLANTS, STRESS_SEED, STRESS_SPREAD, STRESS_FAULTS, STRESS_BATCH = 1000, 0, 2.0, 50.0, 100
 FEW = 500  # loops that are done before workers have started
+OPERATE = "NAME=VALUE"
 PIECES = 4  # a worker at least, so that none waits long for the last
 
 
@@ -42,10 +46,19 @@ def options(parser: argparse.ArgumentParser) -> None:
         help=f"of parameters for which the case states no range ({STRESS_SPREAD:g})")  # fmt: skip
     add("--faults", metavar="PERCENT", type=percent, default=STRESS_FAULTS,
         help=f"share of the loops with a fault of an actuator ({STRESS_FAULTS:g})")  # fmt: skip
+    add("--operate", metavar=OPERATE, type=_operated, action="append", default=[],
+        help="of what operators may change, another value than the file's default")  # fmt: skip
     add("--workers", metavar="N", type=whole(1), help="processes side by side (one a core)")
     add("--batch", metavar="N", type=whole(1), default=STRESS_BATCH, help=f"loops of a piece of work ({STRESS_BATCH})")
     add("--out", metavar="FOLDER", type=Path, help="where the report goes (CASE-LAW-stress)")
     add("--replay", metavar="INDEX", type=whole(0), help="run one loop again, and draw it")
+
+
+def _operated(text: str) -> TimedValue:
+    try:
+        return parse_event(text, OPERATE)
+    except ParamsError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def run(options: argparse.Namespace) -> None:
@@ -54,7 +67,9 @@ def run(options: argparse.Namespace) -> None:
     manifest, content = opened(options.file)
     case = _case_of(manifest)
     drawing = Drawing(case, options.seed, options.spread / 100, options.faults / 100)
-    stress = Stress(drawing, content)
+    operate = {event.name: event.value for event in options.operate}
+    Operate(manifest.operate).with_values(operate)  # an error comes before any work
+    stress = Stress(drawing, content, tuple(operate.items()))
     for tests in drawing.tests.values():
         for test in tests:
             drawing.ranges(drawing.plant_of(test))
@@ -140,4 +155,5 @@ def _options(options: argparse.Namespace) -> str:
         "spread": (options.spread, STRESS_SPREAD),
         "faults": (options.faults, STRESS_FAULTS),
     }
-    return "".join(f" --{name} {value!r}" for name, (value, default) in given.items() if value != default)
+    drawn = "".join(f" --{name} {value!r}" for name, (value, default) in given.items() if value != default)
+    return drawn + "".join(f" --operate {shlex.quote(f'{e.name}={e.value!r}')}" for e in options.operate)

@@ -73,6 +73,14 @@ PASS = (
     "Every number is a hexadecimal float as C's printf writes it with %a and strtod reads it, or nan, inf, -inf.",
 )
 
+PASS_OF_OPERATED = (
+    "given.operate holds what operators change, in the order of the manifest's operate, and given.fresh is 1 for each "
+    "new and good reading, else 0. All scans have the manifest's defaults.",
+    "In a scan the bad reading of one PV does not refuse the sample: for ten periods the law is stepped with fresh = 0 "
+    "and the PV's last good number, then also with its use = 0. The sample is refused where no controlled variable is "
+    "left, where the law has no use of this PV, and where the PV was not read yet.",
+)
+
 
 def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
     """Write the kit into ``folder``, which is made if it is not there, and return what ``vectors.json`` holds.
@@ -109,7 +117,7 @@ def vectors_of(controller: Controller) -> dict[str, Any]:
             "processor": platform.machine(),
             "system": platform.system(),
         },
-        "pass": list(PASS),
+        "pass": [*PASS, *(PASS_OF_OPERATED if {"operate", "fresh"} & set(m.inputs) else ())],
         "tolerance": KIT_TOLERANCE.hex(),
         "chained_tolerance": CHAIN_TOLERANCE.hex(),
         "scale": {name: written(values) for name, values in scale.items()},

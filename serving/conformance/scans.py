@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.controller import Controller
 from loopwright.serving.guard import READ_BACK_MARGIN, InRange, Sample
 from loopwright.serving.loop import Command, ControlLoop, Mode
@@ -162,6 +163,29 @@ def _scans(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
     yield from some(2, "by hand again")
     good = yield KitScan("back to AUTO", good, set_mode=Mode.AUTO)
     yield from some(2, "the last samples")
+    if "fresh" in m.inputs:
+        yield from _gone(m, good)
+
+
+STAYS_BAD = 3  # scans for which readings stay bad after they were bridged
+
+
+def _gone(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
+    """Readings that are bad for longer than they are bridged: of each PV alone, over a gap, and of all together."""
+    bridged = round(BRIDGE_PERIODS)
+    for i, s in enumerate(m.pv):
+        for k in range(bridged + STAYS_BAD):
+            bad = nan if k % 2 else s.high + (s.high - s.low)
+            good = yield KitScan(f"PV {s.name} is bad for {k + 1} scans", _with(good, "pv", i, bad))
+        for _ in range(KIT_RECOVERY + 1):
+            good = yield KitScan(f"after PV {s.name} was bad", good)
+    good = yield KitScan("a PV is bad after missed periods", _with(good, "pv", 0, nan), missed=bridged)
+    good = yield KitScan("a PV is bad after missed periods", _with(good, "pv", 0, nan))
+    for k in range(bridged + STAYS_BAD):
+        none = replace(good, pv=np.full(len(m.pv), nan))
+        good = yield KitScan(f"all PVs are bad for {k + 1} scans", none)
+    for _ in range(KIT_RECOVERY + 2):
+        good = yield KitScan("after all PVs were bad", good)
 
 
 def _moved(m: Manifest, good: Sample) -> Sample:

@@ -1,9 +1,12 @@
-"""Steps of a controller for a host to repeat: from the states of a chain of 300, cold, and with inputs to refuse."""
+"""Steps of a controller for a host to repeat: from the states of a chain of 300, cold, and with inputs to refuse.
+
+A law that reads ``operate`` and ``fresh`` gets values of both that vary over the steps.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import inf, nan
 from typing import TypeAlias
 
@@ -12,7 +15,8 @@ from numpy.typing import NDArray
 
 from loopwright.serving.controller import Controller, Step
 from loopwright.serving.errors import OutputError, SampleError
-from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.manifest import SWITCHES, Manifest, Signal
+from loopwright.serving.operating import Operate
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -23,6 +27,9 @@ COLD_STARTS = 10  # cold starts that a host repeats, each with two steps after i
 STEP_DRAWS = 40  # tried for a step whose MV lies inside its range
 NUDGE = 1e-12  # share of an entry of the state by which a run beside the chain is off: far above rounding's 2e-16
 AT_AN_END = 0.1  # share of the values drawn anywhere that lie at an end of the range
+STEERED = 0.5  # share of the entries of `operate` that are not the default: at all others a loop would hardly move
+STEERED_ANEW = 0.1  # probability a step of a course that operators change something
+UNFRESH = 0.2  # share of the readings that are not fresh
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +37,9 @@ class StepInputs:
     """The inputs of one step without the state. ``cold``: it starts from a state of zeros, else from the last one."""
 
     part: str
-    inputs: dict[str, Array]  # sp (n_sp,), pv (n_pv,), dv (n_dv,), mv_applied (n_mv,)
+    inputs: dict[
+        str, Array
+    ]  # sp (n_sp,), pv (n_pv,), dv (n_dv,), mv_applied (n_mv,); operate, fresh where they are read
     cold: bool = False
 
 
@@ -47,10 +56,10 @@ class StepResult:
 def answered(controller: Controller) -> list[StepResult]:
     """All steps of the kit, as this runtime answers them; a refused step leaves the state as it was."""
     state, last, answers = controller.cold_state(), _middle(controller.manifest.mv), []
-    drawn = _drawn(controller.manifest)
+    drawn, steering = _drawn(controller.manifest), _Steering(controller.manifest)
     choices = next(drawn)
     while True:
-        for given in choices:
+        for given in map(steering.joined, choices):
             answer = _answer(controller, given, state)
             if answer.step is not None and _inside(controller.manifest.mv, answer.step.mv):
                 break
@@ -147,7 +156,7 @@ def _drawn(m: Manifest) -> Generator[list[StepInputs], tuple[StepInputs, Array],
         _, last = yield [StepInputs("stuck actuator", course | {"mv_applied": stuck})]
     for k in range(3 * COLD_STARTS):
         _, last = yield [StepInputs("cold start", anywhere(), cold=k % 3 == 0) for _ in range(STEP_DRAWS)]
-    for name in (n for n in m.inputs if n != "state"):
+    for name in (n for n in m.inputs if n in signals):
         for i in range(len(signals[name])):
             for bad in (nan, inf, -inf):
                 spoilt = course[name].copy()
@@ -155,6 +164,42 @@ def _drawn(m: Manifest) -> Generator[list[StepInputs], tuple[StepInputs, Array],
                 yield [StepInputs("not finite", course | {name: spoilt})]
                 course = moved(course)  # at a rest, a state that was lost would look like the one that was kept
                 _, last = yield [StepInputs("after a refusal", course | {"mv_applied": last})]
+
+
+WITHOUT_PAST = frozenset({"anywhere", "inside", "cold start"})  # parts whose steps have nothing to do with each other
+
+
+@dataclass(slots=True)
+class _Steering:
+    """``operate`` and ``fresh`` of the steps, for a law that reads them: by default at first, then valid values.
+
+    It draws from numbers of its own, so that the steps of all other laws stay as they were.
+    """
+
+    manifest: Manifest
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(3))
+    at: Array | None = None
+
+    def joined(self, given: StepInputs) -> StepInputs:
+        """``given`` and the values of its step."""
+        if not {"operate", "fresh"} & set(self.manifest.inputs):
+            return given
+        if self.at is None:
+            self.at = np.array(self.manifest.usual("operate"))
+        elif given.part in WITHOUT_PAST or self.rng.uniform() < STEERED_ANEW:
+            self.at = self._drawn()
+        fresh = (self.rng.uniform(size=len(self.manifest.pv)) >= UNFRESH).astype(np.float64)
+        values = {"operate": self.at, "fresh": fresh}
+        return replace(given, inputs=given.inputs | {n: v for n, v in values.items() if n in self.manifest.inputs})
+
+    def _drawn(self) -> Array:
+        """Values within the engineered ranges: switches 0 or 1, ranks whole, no low end above its high one."""
+        found = np.array(self.manifest.usual("operate"))
+        for i, e in enumerate(self.manifest.operate):
+            if self.rng.uniform() < STEERED:
+                whole = e.what in SWITCHES or e.what == "rank"
+                found[i] = self.rng.integers(int(e.low), int(e.high) + 1) if whole else self.rng.uniform(e.low, e.high)
+        return Operate(self.manifest.operate).ordered(found)
 
 
 def _anywhere(rng: np.random.Generator, signals: tuple[Signal, ...]) -> Array:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from identified_models import parts
 from rich.console import Console
 from rich.live import Live
 
@@ -23,6 +24,7 @@ from loopwright.pipeline.engine.run_mark import run_marked
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.metrics import mae
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.simulation.live import SimulatedPlant, TerminalView, sparkline
@@ -73,6 +75,32 @@ def test_a_scenario_is_the_one_that_validation_runs(pid_file: Path, plant: Equat
     expected = simulate_closed(plant, step, scenario)
     np.testing.assert_allclose(column(rows, "C_A [mol/l]"), expected.pv[:, 0], rtol=1e-6)
     np.testing.assert_allclose(column(rows, "T_j [K]"), expected.mv[:, 0], rtol=1e-6, atol=1e-4)
+
+
+@pytest.fixture(scope="session")
+def steered_file(plant: EquationPlant, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A predictive law of the case that reads what operators change."""
+    path, model = tmp_path_factory.mktemp("controllers") / "steered.onnx", parts(plant)["identified"]
+    law = Predictive(plant.signals, model, Predictive.Params(horizon=20, operate={})).eval()
+    export(law, path, case=CASE, provenance={})
+    return path
+
+
+def test_a_simulation_has_the_operate_that_is_asked_for(
+    steered_file: Path, pid_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def highest(*options: str) -> float:
+        return float(column(simulate(steered_file, "--sp", "0.5", "--duration", "20", *options), "T_j [K]").max())
+
+    assert highest() > 300
+    assert highest("--operate", "T_j.high=280", "--operate", "speed=2") == 280
+    for file, value in ((steered_file, "T_j.high=900"), (steered_file, "T_j.top=1"), (pid_file, "T_j.high=280")):
+        capsys.readouterr()
+        assert main(["simulate", str(file), "--operate", value]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith("loopwright simulate: ")
+        assert "operate" in said
+        assert said.count("\n") == 1
 
 
 def test_set_points_disturbance_and_manual_happen_when_asked(

@@ -50,6 +50,7 @@ def test_the_report_names_the_worst_and_how_to_run_them_again(capsys: pytest.Cap
         (["--seed", "-1"], "'-1' is not allowed"),
         (["--faults", "101"], "'101' is not allowed; give a percentage from 0 to 100"),
         (["--spread", "nan"], "'nan' is not allowed"),
+        (["--operate", "u.high"], "'u.high' is not of the form NAME=VALUE"),
     ],
 )
 def test_what_is_no_number_is_refused(options: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -59,6 +60,12 @@ def test_what_is_no_number_is_refused(options: list[str], words: str, capsys: py
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
+
+
+def test_a_law_that_operators_do_not_steer_takes_no_operate(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stress", str(PH), "--operate", "u.high=1"]) == 2
+    assert capsys.readouterr().err.startswith("loopwright stress: operate has no entry 'u.high'")
+    assert not list(Path().iterdir())
 
 
 def test_a_file_that_is_no_controller_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

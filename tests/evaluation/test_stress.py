@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from identified_models import made_signals, random_model
+from identified_models import first_order, made_signals, random_model
 from own_cases import controllers_of_a_lag
 
 from loopwright.pipeline.cases import CASES
@@ -22,9 +22,10 @@ from loopwright.pipeline.evaluation.stress.loops import Stress, advance_rows, sw
 from loopwright.pipeline.evaluation.stress.summary import Summary, table
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
-from loopwright.serving import Controller, LoopwrightError, Signal
+from loopwright.serving import ContractError, Controller, LoopwrightError, Signal
 
 ROOT = Path(__file__).parents[2]
 PH = ROOT / "artifacts/ph_neutralization/pid.onnx"
@@ -133,7 +134,12 @@ def step_by_step(stress: Stress, draw: Draw) -> tuple[np.ndarray, np.ndarray]:
         pvs.append(plant.measured(x)[0])
         try:
             mv, state, _ = controller.step(
-                sp=test.sp[k], pv=pvs[-1] + noise[k], dv=dv[k], mv_applied=applied, state=state
+                sp=test.sp[k],
+                pv=pvs[-1] + noise[k],
+                dv=dv[k],
+                mv_applied=applied,
+                state=state,
+                operate=stress.operated,
             )
         except LoopwrightError:
             mv, state = applied, controller.cold_state()
@@ -152,6 +158,26 @@ def test_loops_side_by_side_are_those_of_the_controller(stress: Stress) -> None:
         pv, mv = step_by_step(stress, draw)
         assert np.array_equal(loop.pv, pv)
         assert np.array_equal(loop.mv, mv)
+
+
+def test_loops_have_the_operate_that_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    case = controllers_of_a_lag({})
+    (mv,) = case.plant.mv_signals
+    law = Predictive(case.plant.signals, first_order(0.6), Predictive.Params(horizon=20, operate={})).eval()
+    export(law, tmp_path / "it.onnx", case="it", provenance={})
+    drawing, content, middle = Drawing(case, faults=0.0), (tmp_path / "it.onnx").read_bytes(), mv.middle
+    limited = Stress(drawing, content, ((f"{mv.name}.high", middle), (f"{mv.name}.low", middle - 0.1)))
+    draws = drawing.draws(range(4))
+    free = [loop.mv.max() for _, (loop, _) in Stress(drawing, content).loops(draws)]
+    assert max(free) > middle
+    for draw, (loop, _) in limited.loops(draws):
+        pv, moved = step_by_step(limited, draw)
+        assert np.array_equal(loop.pv, pv)
+        assert np.array_equal(loop.mv, moved)
+        assert loop.mv.max() <= max(middle, draw.scenario.mv0[0])
+    with pytest.raises(ContractError, match="allowed is"):
+        Stress(drawing, content, ((f"{mv.name}.high", mv.high + 1),)).outcomes([0])
 
 
 def test_a_refused_sample_holds_the_mv_and_begins_anew(stress: Stress, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -159,7 +159,7 @@ def test_no_mv_leaves_the_operators_limits_or_moves_faster(seed: int) -> None:
     assert (moves <= fastest + 1e-12).all()
     outside = np.maximum(low - mv[20:], 0) + np.maximum(mv[20:] - high, 0)
     assert (np.diff(outside, axis=0) <= 1e-12).all()  # one that was beyond comes back, none goes out
-    assert not outside[-1].any()
+    assert not outside[-1].any()  # to the bit
 
 
 def test_an_mv_out_of_use_stays_and_the_others_do_its_work(wide: tuple[Predictive, Operate]) -> None:

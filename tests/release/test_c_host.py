@@ -29,6 +29,7 @@ from kits import (
     refuses_an_old_kit,
     refuses_in_one_line,
     scans_of_a_loop,
+    takes_what_operators_change,
     verdict_on,
     wrong_file,
 )
@@ -37,7 +38,7 @@ CMAKE = shutil.which("cmake")
 if CMAKE is None or shutil.which("cc") is None:
     pytest.skip("cmake or a C compiler is missing (apt install cmake gcc)", allow_module_level=True)
 
-pytest_plugins = ["small_laws"]
+pytest_plugins = ["small_laws", "operated_laws"]
 SANITIZERS = "-O1 -g -Werror -fsanitize=address,undefined -fno-sanitize-recover=all"
 
 
@@ -94,6 +95,10 @@ def test_c_refuses_results_and_takes_measured_disturbances(host: Path, disobedie
     answers_refusals_and_disturbances(partial(run, host), disobedient_file, tmp_path / "answers.json")
 
 
+def test_c_takes_what_operators_change(host: Path, operated_file: Path, tmp_path: Path) -> None:
+    takes_what_operators_change(partial(run, host), operated_file, tmp_path / "answers.json")
+
+
 # By damage: the largest difference in one step and chained, and how many answers are wrong.
 EXPECTED = {
     "mv": "0.001, chained 0.001, 0",
@@ -104,6 +109,46 @@ EXPECTED = {
     "start": "0, chained 0, 1",
     "moved": "0, chained 0.8, 0",
 }
+
+
+STEERED = r"""
+#define LOOPWRIGHT_NO_MAIN
+#pragma GCC diagnostic ignored "-Wunused-function"
+#include "host.c"
+int main(int n, char **words) {
+  (void)n;
+  Controller c;
+  Loop l;
+  if (!controller_open(&c, words[1]) || !loop_open(&l, &c, AUTO, 1)) return printf("%s\n", c.words), 1;
+  double pv[2] = {0.1, 0.2}, dv[1] = {0}, mv[2] = {0, 0}, values[64];
+  Sample s = {.pv = pv, .dv = dv, .mv_applied = mv};
+  memcpy(values, c.operate, sizeof *values * c.n_in[OPERATE]);
+  values[operate_place(&c, "u0.use")] = 0.5;
+  printf("%d ", controller_operate(&c, values));
+  values[operate_place(&c, "u0.use")] = 0;
+  printf("%d ", c.operate[operate_place(&c, "u0.use")] == 1);
+  printf("%d ", controller_operate(&c, values));
+  loop_scan(&l, &s);
+  printf("%d ", !l.reason[0] && l.mv[0] == mv[0]);
+  c.fresh[0] = c.fresh[1] = 0;
+  loop_scan(&l, &s);
+  printf("%d ", !l.reason[0]);
+  c.fresh[1] = 0.5;
+  loop_scan(&l, &s);
+  printf("%s\n", l.reason);
+  loop_close(&l);
+  controller_close(&c);
+  return 0;
+}
+"""
+
+
+def test_a_program_around_the_c_host_steers_its_law(operated_file: Path, tmp_path: Path) -> None:
+    """A value that is not allowed changes nothing; a flag that is none is a fault."""
+    (tmp_path / "steered.c").write_text(STEERED.replace("host.c", str(EMBED / "c" / "host.c")))
+    done = run(changed_host(tmp_path / "steered.c"), kit_of(operated_file) / operated_file.name)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.startswith("0 1 1 1 1 fresh of y1 is 0.5; ")
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

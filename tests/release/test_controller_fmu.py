@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from controller_fmus import MISSING, Array, Unit, answers_of, controller_of, file_of, tools, unpacked
-from kits import SHIPPED, name
+from kits import ROUNDING, SHIPPED, name
 
 from loopwright.pipeline.cases import PLANTS
 from loopwright.pipeline.errors import HostError
@@ -27,6 +27,7 @@ from loopwright.pipeline.hosts.fmu.folder import (
     variables_of,
     write_folder,
 )
+from loopwright.pipeline.plants.fmu.instance import NAMES
 from loopwright.serving import Controller
 from loopwright.serving.conformance.steps import StepResult, answered
 
@@ -34,7 +35,7 @@ if MISSING:
     pytest.skip(MISSING, allow_module_level=True)
 fmpy = pytest.importorskip("fmpy")
 
-pytest_plugins = ["small_laws"]
+pytest_plugins = ["small_laws", "operated_laws"]
 PID = "thiosulfate_cstr/pid"
 # Laws with and without state, read-back and network; several MVs, one of set values.
 # The law's part is the same C in both versions, so only some are played in both.
@@ -75,7 +76,7 @@ def compared(controller: Controller, answers: list[StepResult], u: Unit) -> Coun
     for answer in answers:
         if answer.given.cold:
             u.reset()
-            u.begin()
+            u.begin(**({"use_fresh": True} if "fresh" in groups else {}))
         before = found()
         u.set(**{group: answer.given.inputs[group] for group in groups})
         u.step(controller.manifest.period_s)
@@ -108,6 +109,113 @@ def test_an_fmu_refuses_results_and_takes_measured_disturbances(
         assert len(u.said) == seen["input"] + seen["output"]
         ends = ("%, which it may not have", "it may move by at most 30 a period")
     assert sum("the law gave valve = " in words and any(end in words for end in ends) for words in u.said) > 0
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def operated(
+    request: pytest.FixtureRequest, operated_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Controller, Path]:
+    """A controller that reads ``operate`` and ``fresh``, and the folder of its FMU."""
+    controller, folder = Controller(operated_file), tmp_path_factory.mktemp("operated")
+    write_folder(controller, folder, request.param, tools())
+    assert problems(folder) == []
+    return controller, folder
+
+
+def test_an_fmu_takes_what_operators_change(operated: tuple[Controller, Path]) -> None:
+    controller, folder = operated
+    with closing(Unit(folder)) as u:
+        assert [name.removeprefix("operate.") for name in u.names("operate")] == [
+            e.name for e in controller.manifest.operate
+        ]
+        assert u.names("fresh") == ["fresh.y0", "fresh.y1"]
+        seen = compared(controller, answered(controller), u)
+        assert seen[""] > 300
+    variables = {v.name: v for v in fmpy.read_model_description(str(folder)).modelVariables}
+    for e in controller.manifest.operate:
+        v = variables[f"operate.{e.name}"]
+        assert (float(v.min), float(v.max), float(v.start), v.unit or "") == (e.low, e.high, e.default, e.unit)
+        assert (v.causality, v.variability) == ("parameter", "tunable")
+        assert v.description
+
+
+def test_without_a_value_an_fmu_has_the_defaults_and_all_is_fresh(operated: tuple[Controller, Path]) -> None:
+    """A tool that writes 0 to each input without a connection blinds no law: use_fresh is false."""
+    controller, folder = operated
+    state, mv = controller.cold_state(), np.zeros(2)
+    with closing(Unit(folder)) as u:
+        u.begin()
+        u.set(fresh=[0.0, 0.0])
+        for k in range(20):
+            pv = [0.3 * np.sin(k), 0.1 * k]
+            mv, state, _ = controller.step(sp=[0.5, 0], pv=pv, dv=[0.1], mv_applied=mv, state=state)
+            u.set(sp=[0.5, 0], pv=pv, dv=[0.1])
+            u.step(1.0)
+            assert bytes(u.get("mv")) == bytes(mv)
+            assert not u.fault
+
+
+def as_number(u: Unit, name: str) -> None:
+    """Set a Boolean variable as if it were a real one."""
+    getattr(u.fmu, NAMES[u.fmi]["set"])([u.references[name]], [1.0])
+
+
+def test_a_value_that_operators_may_not_set_is_refused_by_an_fmu(operated: tuple[Controller, Path]) -> None:
+    with closing(Unit(operated[1], logging=True)) as u:
+        for act, words in (
+            (lambda: u.set(operate__u0__high=2.0), "operate: u0.high is 2; allowed is -1 to 1 V"),
+            (lambda: u.set(operate__u0__use=0.5), "operate: u0.use is 0.5; allowed is 0 or 1"),
+            (lambda: u.set(operate__y0__rank=np.nan), "operate: y0.rank is nan; allowed is 1 to 4"),
+            (lambda: as_number(u, "use_fresh"), "there is no real variable"),
+            (lambda: u.begin(operate__u0__low=0.5, operate__u0__high=0.2), "u0.low is 0.5, above u0.high = 0.2; "),
+        ):
+            with pytest.raises(Exception, match="failed"):
+                act()
+            assert words in u.said[-1]
+        u.reset()
+        u.begin(operate__u0__low=-0.1, operate__u0__high=0.2, use_fresh=True)
+        for k in range(10):
+            u.set(sp=[(-1.0) ** k, 1.0], pv=[0.1 * k, 0.0])
+            u.step(1.0)
+            assert -0.1 - ROUNDING <= u.get("mv")[0] <= 0.2 + ROUNDING
+        before = u.written()
+        u.set(operate__u0__low=0.9)
+        with pytest.raises(Exception, match="failed"):
+            u.step(1.0)
+        assert "u0.low is 0.9, above u0.high = 0.2" in u.said[-1]
+        u.set(operate__u0__low=-0.1)
+        assert u.written() == before
+        assert not u.fault
+        u.set(operate__u0__use=0.0, fresh=[1.0, 0.0])
+        held = u.get("mv")[0]
+        u.step(1.0)
+        assert u.get("mv")[0] == held
+        u.set(fresh=[1.0, 0.5])  # no flag: as an input that is not finite
+        u.step(1.0)
+        assert u.fault
+        with pytest.raises(Exception, match="failed"):
+            u.set(use_fresh=False)
+        assert "use_fresh cannot be set after the initialization" in u.said[-1]
+
+
+def test_a_saved_state_keeps_what_operators_have_changed(operated: tuple[Controller, Path]) -> None:
+    with closing(Unit(operated[1], logging=True)) as u, closing(Unit(operated[1])) as other:
+        u.begin(use_fresh=True)
+        u.set(operate__u1__high=0.4, operate__speed=2.0, fresh=[0.0, 1.0], pv=[0.2, 0.3])
+        u.step(1.0)
+        content = u.written()
+        other.read(content)
+        other.now = u.now
+        for each in (u, other):
+            each.set(pv=[0.5, -0.2])
+            each.step(1.0)
+        assert u.written() == other.written()
+        place = 72 + 8 * (7 + u.references["operate.u1.high"] - 3)
+        assert np.frombuffer(content[place : place + 8])[0] == 0.4
+        for wrong in (np.nan, 1.5):
+            with pytest.raises(Exception, match="failed"):
+                u.read(content[:place] + np.float64(wrong).tobytes() + content[place + 8 :])
+            assert "the saved state has operate: u1.high is" in u.said[-1]
 
 
 def test_the_gate_lets_no_fmu_of_another_controller_pass(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from kits import (
     refuses_an_old_kit,
     refuses_in_one_line,
     scans_of_a_loop,
+    takes_what_operators_change,
     verdict_on,
     wrong_file,
 )
@@ -33,7 +34,7 @@ NODE = shutil.which("node")
 if NODE is None or not (EMBED / "node" / "node_modules").is_dir():
     pytest.skip("node or its packages are missing (npm ci in examples/embed/node)", allow_module_level=True)
 
-pytest_plugins = ["small_laws"]
+pytest_plugins = ["small_laws", "operated_laws"]
 
 
 def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -82,6 +83,10 @@ def test_node_refuses_results_and_takes_measured_disturbances(disobedient_file: 
     answers_refusals_and_disturbances(run, disobedient_file, tmp_path / "answers.json")
 
 
+def test_node_takes_what_operators_change(operated_file: Path, tmp_path: Path) -> None:
+    takes_what_operators_change(run, operated_file, tmp_path / "answers.json")
+
+
 # By damage: the largest difference in one step and chained, and how many answers are wrong.
 EXPECTED = {
     "mv": "0.00100, chained 0.00100, 0",
@@ -92,6 +97,46 @@ EXPECTED = {
     "start": "0.00, chained 0.00, 1",
     "moved": "0.00, chained 0.800, 0",
 }
+
+
+STEERED = """
+import { readFileSync } from "node:fs";
+import { createRequire } from "node:module";
+const [host, file] = process.argv.slice(1);
+const ort = createRequire(host)("onnxruntime-node");
+const { Controller, Loop } = await import(host.replace("node/host", "javascript/controller"));
+const manifest = JSON.parse(readFileSync(file.replace("onnx", "json")));
+const controller = await Controller.load(ort, readFileSync(file), manifest, "cpu");
+const loop = new Loop(controller, { sp: [0, 0], mode: "AUTO", recoverAfter: 1 });
+const good = { pv: [0.1, 0.2], dv: [0], mv_applied: [0.3, 0], age_s: 0 };
+const refused = [], found = [];
+const bads = [{ "u0.use": 0.5 }, { "y0.low": 1, "y0.high": 0 }, { "u0.rest": "0" }, { "u0.cost": NaN }, { nothing: 1 }];
+for (const bad of bads)
+  try { loop.setOperate(bad); } catch (error) { refused.push(error.because); }
+const byDefault = () => loop.operate.every((value, i) => value === manifest.operate[i].default);
+const unchanged = byDefault();
+loop.setOperate({ "u0.use": 0 });
+for (const fresh of [undefined, [1, 0], [0, 0], [1, 0.5], [1], [NaN, 1]]) {
+  const scan = await loop.scan({ ...good, fresh });
+  found.push([scan.mv[0], scan.mode, scan.law && scan.law[1]]);
+}
+loop.replace(controller);
+console.log(JSON.stringify({ refused, unchanged, found, replaced: byDefault() }));
+"""
+
+
+def test_a_program_around_the_node_host_steers_its_law(operated_file: Path) -> None:
+    """A value that is not allowed changes nothing; a flag that is none is a fault."""
+    host, file = EMBED / "node" / "host.mjs", kit_of(operated_file) / operated_file.name
+    command = [str(NODE), "--input-type=module", "-e", STEERED, str(host), str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["refused"] == ["input"] * 5
+    assert told["unchanged"]
+    assert told["replaced"]
+    assert [mv for mv, *_ in told["found"]] == [0.3] * 6  # out of use, or held
+    assert [mode for _, mode, _ in told["found"]] == ["AUTO"] * 3 + ["HOLD"] * 3
 
 
 @pytest.mark.parametrize("damage", DAMAGES)

@@ -24,8 +24,10 @@ from loopwright.serving import Controller, LoopwrightError, OutputError, SampleE
 from loopwright.serving.__main__ import main
 from loopwright.serving.conformance.kit import PASS, VECTORS, check, read, write_kit, written
 from loopwright.serving.controller_file import TRAILER_BYTES
+from loopwright.serving.manifest import SWITCHES
+from loopwright.serving.operating import Operate
 
-pytest_plugins = ["small_laws"]
+pytest_plugins = ["small_laws", "operated_laws"]
 Capture = pytest.CaptureFixture[str]
 Json = dict[str, Any]
 Array = np.ndarray[Any, np.dtype[np.float64]]
@@ -136,6 +138,59 @@ def test_300_steps_are_chained_over_the_whole_ranges(pi_file: Path, vectors: Jso
     mv = np.array([read(row["gives"]["mv"], "mv")[0] for row in rows])
     assert {0.0, 100.0} <= set(mv)  # saturated at both ends
     assert ((mv > 0) & (mv < 100)).sum() > 100  # and elsewhere a wrong digit shows
+
+
+@pytest.fixture(scope="module")
+def steered(operated_file: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Controller, Path]:
+    """The controller that reads ``operate`` and ``fresh``, and its kit."""
+    controller, folder = Controller(operated_file), tmp_path_factory.mktemp("steered")
+    write_kit(controller, folder)
+    return controller, folder
+
+
+def test_a_kit_holds_what_operators_change(steered: tuple[Controller, Path], vectors: Json) -> None:
+    controller, folder = steered
+    rows, entries = json.loads((folder / VECTORS).read_text()), controller.manifest.operate
+    given = np.array([read(row["given"]["operate"], "operate") for row in rows["steps"]])
+    checked = Operate(entries).checked
+    assert all(bytes(checked(row)) == bytes(row) for row in given)
+    assert bytes(given[0]) == bytes(checked([e.default for e in entries]))
+    varied = [len(set(column)) for column in given.T]
+    for e, column, n in zip(entries, given.T, varied, strict=True):
+        assert n > (1 if e.what in {*SWITCHES, "rank"} else 20)
+        assert e.what != "rank" or set(column) == {1.0, 2.0, 3.0, 4.0}
+    fresh = np.array([read(row["given"]["fresh"], "fresh") for row in rows["steps"]])
+    assert set(map(tuple, fresh)) == {(0, 0), (0, 1), (1, 0), (1, 1)}
+    assert rows["kit"] == vectors["kit"]  # the format of the others stays
+    assert vectors["pass"] == list(PASS)
+    assert rows["pass"][: len(PASS)] == list(PASS)
+    assert not {"operate", "fresh"} & set(vectors["steps"][0]["given"])
+
+
+def test_a_kit_holds_readings_that_stay_bad(steered: tuple[Controller, Path]) -> None:
+    """Of one PV: bridged, then left out. Of all: HOLD once none is left."""
+    scans = json.loads((steered[1] / VECTORS).read_text())["scans"]
+    known = {row["what"]: (row["mode"], row["fault"]) for row in scans}
+    for k in range(1, 14):
+        assert known[f"PV y0 is bad for {k} scans"] == ("AUTO", False)
+        assert known[f"all PVs are bad for {k} scans"] == (("AUTO", False) if k <= 10 else ("HOLD", True))
+    assert scans[-1]["mode"] == "AUTO"
+    moves = [row["mv"] for row in scans if row["what"].startswith("PV y0 is bad")]
+    assert len(set(map(tuple, moves))) > 5  # the law goes on
+
+
+@pytest.mark.parametrize("left_out", [None, "operate", "fresh"])
+def test_a_host_that_leaves_operators_out_does_not_pass(
+    left_out: str | None, steered: tuple[Controller, Path], tmp_path: Path
+) -> None:
+    controller, folder = steered
+    vectors = json.loads((folder / VECTORS).read_text())
+    for row in vectors["steps"]:
+        row["given"].pop(left_out, None)
+    (tmp_path / "answers.json").write_text(json.dumps(played(controller, vectors)))
+    verdict = check(folder, tmp_path / "answers.json", controller.sha256)
+    assert verdict.identical == (left_out is None)
+    assert verdict.passed == (left_out is None)
 
 
 def test_each_value_that_is_not_finite_is_refused(vectors: Json) -> None:

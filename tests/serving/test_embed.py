@@ -18,6 +18,7 @@ from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import ControlLaw
 from loopwright.serving import Controller
 
+pytest_plugins = ["operated_laws"]
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / "examples" / "embed" / "python"
 # An example with one file after another, in a process that loads its libraries once: what it prints of each, and
@@ -60,6 +61,22 @@ def test_both_examples_give_the_controllers_bits(make_law: object, name: str, tm
     first = controller.step(sp=0.5, pv=[0.0, 200.0], mv_applied=0.0, state=controller.cold_state())
     assert ast.literal_eval(ours.partition("] ")[0] + "]") == first.mv.tolist()
     assert np.isfinite(first.mv).all()
+
+
+def test_a_law_that_operators_steer_has_its_defaults_in_the_examples(operated_file: Path, tmp_path: Path) -> None:
+    ours, plain = run("python_runtime.py", operated_file), run("plain_onnxruntime.py", operated_file)
+    assert ours == plain
+    assert len(set(ours.splitlines())) > 10
+    words = [
+        sys.executable,
+        str(EXAMPLES / "conformance.py"),
+        str(kit_of(operated_file)),
+        str(tmp_path / "answers.json"),
+    ]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools/roots")}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert verdict_on(operated_file, tmp_path / "answers.json").identical
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from shipped_files import SHIPPED
 from loopwright.serving import ArtifactError, Controller, OutputError, SignatureError, first_steps
 from loopwright.serving.first_steps import take, tried
 
-pytest_plugins = ["small_laws"]
+pytest_plugins = ["small_laws", "operated_laws"]
 
 
 def test_what_was_tried_is_what_is_loaded(pi_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,6 +45,22 @@ def test_a_file_that_ends_its_process_is_refused_and_ends_no_other(
     with pytest.raises(ArtifactError, match="SIGSEGV") as caught:
         tried(file)
     assert "\n" not in str(caught.value)
+
+
+def test_a_law_that_operators_steer_is_tried_at_both_ends(operated_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    controller, seen = Controller(operated_file), set()
+    step = controller.step
+
+    def counted(**given: Any) -> Any:
+        seen.add(tuple(map(float, given.get("operate", ()))))
+        seen.add(tuple(map(float, given.get("fresh", ()))))
+        return step(**given)
+
+    monkeypatch.setattr(controller, "step", counted)
+    take(controller)
+    ends = {tuple(getattr(e, end) for e in controller.manifest.operate) for end in ("low", "high")}
+    assert seen == {(), *ends, (0.0, 0.0)}
+    assert tried(operated_file).sha256 == controller.sha256
 
 
 def fails(error: Exception) -> Callable[..., Any]:

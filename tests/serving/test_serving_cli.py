@@ -17,7 +17,7 @@ from loopwright.serving.station import command
 from loopwright.serving.station.settings import template
 from loopwright.serving.words import harmless, plain
 
-pytest_plugins = ["small_laws"]
+pytest_plugins = ["small_laws", "operated_laws"]
 Capture = pytest.CaptureFixture[str]
 
 
@@ -38,6 +38,19 @@ def test_card(pi_file: Path, capsys: Capture) -> None:
     ):
         assert line in card.splitlines()
     assert Controller(pi_file).sha256 in card
+
+
+def test_the_card_says_what_operators_may_change(operated_file: Path, pi_file: Path, capsys: Capture) -> None:
+    assert main(["inspect", str(operated_file)]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for e in Controller(operated_file).manifest.operate:
+        switch = e.what in {"use", "track", "rest_use"}
+        allowed = ["0", "or", "1"] if switch else [f"{e.low:g}", "..", f"{e.high:g}"]
+        assert [e.name, f"{e.default:g}", *allowed, *([e.unit] if e.unit else [])] in rows
+    assert main(["inspect", str(operated_file), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["operate"]) == len(Controller(operated_file).manifest.operate)
+    assert main(["inspect", str(pi_file)]) == 0
+    assert "operate" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

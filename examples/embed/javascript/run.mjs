@@ -56,3 +56,13 @@ export class MadeUpPlant {
 
 // Set points to begin with; give those of your plant.
 export const start = (manifest) => ({ sp: manifest.sp.map(middle) });
+
+// NAME=VALUE words of what operators may change, as y0.low=40, together.
+export const operated = (words) =>
+  Object.fromEntries(
+    words.map((text) => {
+      const [, name, value] = /^(.+)=([^=]+)$/.exec(text) ?? [];
+      if (!name || !value.trim() || !Number.isFinite(Number(value))) throw new Error(`${text} is not NAME=VALUE`);
+      return [name, Number(value)];
+    })
+  );

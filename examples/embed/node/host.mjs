@@ -1,11 +1,12 @@
-// node host.mjs FILE.onnx [SCANS [PERIOD_S]]            a loop on a made-up plant
+// node host.mjs FILE.onnx [SCANS [PERIOD_S [NAME=VALUE ...]]]   a loop on a made-up plant; NAME=VALUE: of what operators
+//                                                       may change, as y0.low=-1
 // node host.mjs --conformance KIT [ANSWERS.json]        the kit of `loopwright conformance FILE.onnx KIT`
 import { readFileSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
 import { join } from "node:path";
 import * as ort from "onnxruntime-node";
 import { Controller, Loop } from "../javascript/controller.mjs";
-import { MadeUpPlant, run, start } from "../javascript/run.mjs";
+import { MadeUpPlant, operated, run, start } from "../javascript/run.mjs";
 import { conform } from "../javascript/vectors.mjs";
 
 const version = createRequire(import.meta.url)("onnxruntime-node/package.json").version;
@@ -23,9 +24,10 @@ async function conformance(kit, out) {
   return passed ? 0 : 1;
 }
 
-async function control(file, scans = 20, period) {
+async function control(file, scans = 20, period, ...changes) {
   const controller = await Controller.load(ort, readFileSync(file), json(file.replace(/\.onnx$/, ".json")), "cpu");
   const loop = new Loop(controller, { ...start(controller.manifest), mode: "AUTO", recoverAfter: 5 });
+  loop.setOperate(operated(changes));
   await run(loop, new MadeUpPlant(controller.manifest), {
     scans: Number(scans),
     ...(period && { period: Number(period) }),
@@ -38,7 +40,7 @@ async function control(file, scans = 20, period) {
 
 const [first, ...rest] = process.argv.slice(2);
 if (!first || (first === "--conformance" && !rest.length)) {
-  console.error("usage: node host.mjs FILE.onnx [SCANS [PERIOD_S]] | node host.mjs --conformance KIT [ANSWERS.json]");
+  console.error("usage: node host.mjs FILE.onnx [SCANS [PERIOD_S [NAME=VALUE ...]]] | node host.mjs --conformance KIT [ANSWERS.json]");
   process.exit(2);
 }
 try {

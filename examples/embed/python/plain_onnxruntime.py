@@ -13,11 +13,11 @@ session = ort.InferenceSession(file, options, providers=["CPUExecutionProvider"]
 m = json.loads(session.get_modelmeta().custom_metadata_map["loopwright.manifest"])
 names = [output.name for output in session.get_outputs()]
 low, high, most = np.array([[s["low"], s["high"], s.get("max_move", np.inf)] for s in m["mv"]]).T  # of continuous MVs
-state, mv = np.zeros(m["n_state"]), low  # mv stands for your read-back
+state, mv, operate = np.zeros(m["n_state"]), low, [e["default"] for e in m.get("operate", [])]  # mv: your read-back
 for k in range(100):  # once every m["period_s"] seconds
     given = {n: np.array([(s["low"] + s["high"]) / 2 for s in m[n]]) for n in ("sp", "dv")}
     pv = np.array([s["low"] + (s["high"] - s["low"]) * (k % 10) / 10 for s in m["pv"]])
-    given |= {"pv": pv, "mv_applied": mv, "state": state}
+    given |= {"pv": pv, "mv_applied": mv, "state": state, "operate": np.array(operate), "fresh": np.ones(len(pv))}
     result = dict(zip(names, session.run(None, {n: given[n] for n in m["inputs"]}), strict=True))
     old, mv, state, info = mv, result["mv"], result.get("state_next", state), result.get("info", np.zeros(0))
     allowed = (low <= mv) & (mv <= high) & (abs(mv - old) <= most * (1 + 1e-9))  # the runtime also checks the file

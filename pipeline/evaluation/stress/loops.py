@@ -20,6 +20,7 @@ from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.simulate import Trajectory
 from loopwright.serving.controller import Controller
 from loopwright.serving.manifest import Manifest
+from loopwright.serving.operating import Operate
 from loopwright.serving.vectorized_controller import VectorizedController
 
 AdvanceRows = Callable[[Array, Array, Array, Array], Array]
@@ -110,10 +111,14 @@ class StressOutcome:
 
 @dataclass(frozen=True)
 class Stress:
-    """The needs of a worker for a batch of loops: how they are drawn, and the bytes of the controller file."""
+    """The needs of a worker for a batch of loops: how they are drawn, and the bytes of the controller file.
+
+    ``operate`` holds the values, by name, of what operators have changed; the rest are the file's defaults.
+    """
 
     drawing: Drawing
     content: bytes
+    operate: tuple[tuple[str, float], ...] = ()
 
     @cached_property
     def controller(self) -> Controller:
@@ -122,6 +127,11 @@ class Stress:
             path = Path(folder) / "controller.onnx"
             path.write_bytes(self.content)
             return Controller(path)
+
+    @cached_property
+    def operated(self) -> Array | None:
+        """Values of ``operate`` (n_operate,); None where they are the defaults. ContractError for a wrong one."""
+        return Operate(self.controller.manifest.operate).with_values(dict(self.operate)) if self.operate else None
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}  # a session stays where it was made
@@ -157,13 +167,15 @@ class Stress:
         known = [t.parameters(plant) for t in tests]
         mv0, x = np.stack([t.mv0 for t in tests]), np.stack([t.x0 for t in tests])
         law, advance = VectorizedController(self.controller, n), advance_rows(plant, n)
+        operate = None if self.operated is None else np.tile(self.operated, (n, 1))
         actuators = Actuators(plant.mv_signals, [d.fault for d in draws], mv0, [d.late for d in draws])
         state, readback, broke = law.cold_state(), mv0.copy(), np.zeros(n, dtype=bool)
         pvs, mvs = np.empty((samples, n, noise.shape[2])), np.empty((samples, *mv0.shape))
         xs, refused = np.empty((samples, *x.shape)), np.zeros((samples, n), dtype=bool)
         for k in range(samples):
             xs[k], pvs[k] = x, plant.measured(x)
-            step = law.step(sp=sp[k], pv=pvs[k] + noise[k], dv=measured[k], mv_applied=readback, state=state)
+            seen = pvs[k] + noise[k]
+            step = law.step(sp=sp[k], pv=seen, dv=measured[k], mv_applied=readback, state=state, operate=operate)
             refused[k] = step.refused
             command = np.where(step.refused[:, None], readback, step.mv)
             state = np.where(step.refused[:, None], 0.0, step.state)

@@ -1,6 +1,7 @@
 /* A Loopwright controller file in C11, on onnxruntime's C API and POSIX clocks.
 
-     host FILE.onnx [SCANS [PERIOD_S]]            a loop on a made-up plant; put yours into plant_read and plant_write
+     host FILE.onnx [SCANS [PERIOD_S [NAME=VALUE ...]]]   a loop on a made-up plant; put yours into plant_read and
+                                                  plant_write. NAME=VALUE: of what operators may change, as y0.low=-1
      host --conformance KIT [ANSWERS.json]        the kit of `loopwright conformance FILE.onnx KIT`
 
    The parts: JSON, SHA-256, controller, loop, plant, run, conformance, main. To use the controller and the loop in a
@@ -261,9 +262,18 @@ typedef struct {
   size_t n;
 } Signals;
 
-enum { SP, PV, DV, MV, STATE, INPUTS };
+typedef struct {
+  char *name; /* as y0.low; of the whole law speed */
+  const char *unit;
+  double standard, low, high; /* its default, and the engineered range */
+  bool is_switch;             /* 0 or 1 */
+  bool of_cv;                 /* of a controlled variable */
+  size_t above; /* of a low end: the place of the high one, which it must not exceed; its own place of any other */
+} Operate;
+
+enum { SP, PV, DV, MV, STATE, OPERATE, FRESH, INPUTS }; /* the first four have signals */
 enum { OUT_MV, OUT_STATE, OUT_INFO, OUTPUTS };
-static const char *const INPUT[INPUTS] = {"sp", "pv", "dv", "mv_applied", "state"};
+static const char *const INPUT[INPUTS] = {"sp", "pv", "dv", "mv_applied", "state", "operate", "fresh"};
 static const char *const OUTPUT[OUTPUTS] = {"mv", "state_next", "info"};
 
 typedef enum { STEPPED, REFUSED_INPUT, REFUSED_OUTPUT } Outcome;
@@ -275,6 +285,9 @@ typedef struct {
   size_t n_in[INPUTS], n_out[OUTPUTS];
   bool uses[INPUTS];
   double period_s;
+  Operate *operate_entries; /* what operators may change, n_in[OPERATE] of them */
+  double *operate; /* of all steps; the defaults until controller_operate */
+  double *fresh; /* 1 for a new and good reading of each PV, else 0: all 1 unless you write them before a step */
   double *state;       /* what the law remembers: the last step's state_next; zeros: no past */
   double *in[INPUTS];  /* the session reads here */
   double *out[OUTPUTS]; /* and writes here: mv, state_next and info of the last step */
@@ -355,10 +368,80 @@ static bool read_signals(Controller *c, const char *key, Signals *signals) {
   return true;
 }
 
+/* The place of an entry of operate by its name, as y0.low; n_in[OPERATE] where there is none. */
+static size_t operate_place(const Controller *c, const char *name) {
+  size_t i = 0;
+  while (i < c->n_in[OPERATE] && strcmp(c->operate_entries[i].name, name)) i++;
+  return i;
+}
+
+static bool read_operate(Controller *c) {
+  const Json *list = json_get(&c->manifest, "operate");
+  size_t n = c->n_in[OPERATE] = list && list->kind == J_LIST ? list->n : 0;
+  if (list && list->kind != J_LIST) return failed(c, "the manifest's operate is no list");
+  if (!(c->operate_entries = calloc(n + 1, sizeof *c->operate_entries))) return failed(c, "no memory");
+  for (size_t i = 0; i < n; i++) {
+    const Json *row = &list->items[i];
+    const char *signal = json_word(row, "signal"), *what = json_word(row, "what");
+    Operate *e = &c->operate_entries[i];
+    size_t room = strlen(signal) + strlen(what) + 2;
+    if (!(e->name = malloc(room))) return failed(c, "no memory");
+    snprintf(e->name, room, "%s%s%s", signal, *signal ? "." : "", what);
+    e->unit = json_word(row, "unit");
+    e->standard = json_number(json_get(row, "default"));
+    e->low = json_number(json_get(row, "low"));
+    e->high = json_number(json_get(row, "high"));
+    e->of_cv = !strcmp(json_word(row, "group"), "cv");
+    e->is_switch = !strcmp(what, "use") || !strcmp(what, "track") || !strcmp(what, "rest_use");
+    if (!(e->low <= e->standard && e->standard <= e->high) || !isfinite(e->high - e->low))
+      return failed(c, "operate: %.200s has no range with a default in it", e->name);
+  }
+  for (size_t i = 0; i < n; i++) {
+    char name[WORDS];
+    Operate *e = &c->operate_entries[i];
+    size_t stem = strlen(e->name);
+    e->above = i;
+    if (strcmp(json_word(&list->items[i], "what"), "low")) continue;
+    snprintf(name, sizeof name, "%.*shigh", (int)(stem - 3), e->name);
+    if ((e->above = operate_place(c, name)) == n) return failed(c, "operate: %.200s stands without a high end", e->name);
+  }
+  return true;
+}
+
+/* Whether one value may be given, at place i of operate. NaN: false. */
+static bool operate_within(Controller *c, size_t i, double value) {
+  const Operate *e = &c->operate_entries[i];
+  if (e->low <= value && value <= e->high && (!e->is_switch || value == 0 || value == 1)) return true;
+  if (e->is_switch && e->low < e->high) return failed(c, "operate: %.200s is %.6g; allowed is 0 or 1", e->name, value);
+  return failed(c, "operate: %.200s is %.6g; allowed is %.6g to %.6g%s%.40s", e->name, value, e->low, e->high,
+                *e->unit ? " " : "", e->unit);
+}
+
+/* Whether a law may be given these n values, as the manifest's operate lists them. */
+static bool operate_allowed(Controller *c, const double *values, size_t n) {
+  for (size_t i = 0; i < n; i++)
+    if (!operate_within(c, i, values[i])) return false;
+  for (size_t i = 0; i < n; i++) {
+    const Operate *e = &c->operate_entries[i];
+    if (values[i] > values[e->above])
+      return failed(c, "operate: %.150s is %.6g, above %.150s = %.6g; a low end must not be above the high one", e->name,
+                    values[i], c->operate_entries[e->above].name, values[e->above]);
+  }
+  return true;
+}
+
+/* From the next step on the law has these values (n_in[OPERATE]). False, and nothing changed, where one is not allowed:
+   outside its engineered range, a switch neither 0 nor 1, a low end above the high one. */
+static bool controller_operate(Controller *c, const double *values) {
+  if (!operate_allowed(c, values, c->n_in[OPERATE])) return false;
+  memcpy(c->operate, values, c->n_in[OPERATE] * sizeof *values);
+  return true;
+}
+
 /* The manifest inside the file. Entries that a host acts on must stand in the JSON beside it too: whoever changed
    that one would else be shown other ranges than those that hold. */
 static bool find_manifest(Controller *c, const Json *beside) {
-  static const char *const ACTED_ON[] = {"schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv"};
+  static const char *const ACTED_ON[] = {"schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv", "operate"};
   OrtModelMetadata *metadata = NULL;
   OrtAllocator *allocator = NULL;
   char *text = NULL;
@@ -366,10 +449,12 @@ static bool find_manifest(Controller *c, const Json *beside) {
                good(c, c->ort->GetAllocatorWithDefaultOptions(&allocator)) &&
                good(c, c->ort->ModelMetadataLookupCustomMetadataMap(metadata, allocator, "loopwright.manifest", &text));
   if (found && (!text || !json_object(text, &c->manifest))) found = failed(c, "the file holds no manifest");
-  for (size_t i = 0; found && i < sizeof ACTED_ON / sizeof *ACTED_ON; i++)
-    if (!json_same(json_get(&c->manifest, ACTED_ON[i]), json_get(beside, ACTED_ON[i])))
+  for (size_t i = 0; found && i < sizeof ACTED_ON / sizeof *ACTED_ON; i++) {
+    const Json *inside = json_get(&c->manifest, ACTED_ON[i]), *other = json_get(beside, ACTED_ON[i]);
+    if ((inside || other) && !json_same(inside, other))
       found = failed(c, "the JSON beside the file has another %s than the manifest inside it; get both from one place",
                      ACTED_ON[i]);
+  }
   if (text) found = good(c, c->ort->AllocatorFree(allocator, text)) && found;
   if (metadata) c->ort->ReleaseModelMetadata(metadata);
   return found;
@@ -383,6 +468,8 @@ static bool read_manifest(Controller *c) {
     if (!read_signals(c, KEY[i], &c->signals[i])) return false;
     c->n_in[i] = c->signals[i].n;
   }
+  if (!read_operate(c)) return false;
+  c->n_in[FRESH] = c->n_in[PV];
   double n_state = json_number(json_get(m, "n_state"));
   c->period_s = json_number(json_get(m, "period_s"));
   if (!(n_state >= 0 && n_state <= 1e6 && n_state == floor(n_state))) return failed(c, "the manifest has no n_state");
@@ -398,6 +485,8 @@ static bool read_manifest(Controller *c) {
     if (i == INPUTS) return failed(c, "the manifest names an input that no controller has");
     c->uses[i] = true;
   }
+  if (c->uses[OPERATE] && !c->n_in[OPERATE])
+    return failed(c, "the manifest's law reads operate, but the manifest has no entries of it");
   for (size_t i = 0; i < c->n_in[MV]; i++)
     if (!c->uses[MV] && c->signals[MV].at[i].max_move < INFINITY)
       return failed(c, "the moves of %s are limited, but its law does not read mv_applied", c->signals[MV].at[i].name);
@@ -466,8 +555,12 @@ static void controller_close(Controller *c) {
     for (size_t k = 0; c->signals[i].at && k < c->signals[i].n; k++) free(c->signals[i].at[k].values);
     free(c->signals[i].at);
   }
+  for (size_t i = 0; c->operate_entries && i < c->n_in[OPERATE]; i++) free(c->operate_entries[i].name);
   if (c->session) c->ort->ReleaseSession(c->session);
   if (c->env) c->ort->ReleaseEnv(c->env);
+  free(c->operate_entries);
+  free(c->operate);
+  free(c->fresh);
   free(c->state);
   json_free(&c->manifest);
 }
@@ -498,16 +591,28 @@ static bool controller_open(Controller *c, const char *path) {
   for (int i = 0; made && i < OUTPUTS; i++) made = bind(c, cpu, c->n_out[i], &c->out[i], &c->out_value[i]);
   if (cpu) c->ort->ReleaseMemoryInfo(cpu);
   if (!made) return false;
-  if (!(c->state = calloc(c->n_in[STATE] + 1, sizeof *c->state))) return failed(c, "no memory");
+  c->state = calloc(c->n_in[STATE] + 1, sizeof *c->state);
+  c->operate = calloc(c->n_in[OPERATE] + 1, sizeof *c->operate);
+  c->fresh = calloc(c->n_in[FRESH] + 1, sizeof *c->fresh);
+  if (!c->state || !c->operate || !c->fresh) return failed(c, "no memory");
+  for (size_t k = 0; k < c->n_in[OPERATE]; k++) c->in[OPERATE][k] = c->operate_entries[k].standard;
+  if (!controller_operate(c, c->in[OPERATE])) return false;
+  for (size_t k = 0; k < c->n_in[FRESH]; k++) c->fresh[k] = c->in[FRESH][k] = 1;
   for (int i = 0; i < STATE; i++)
     for (size_t k = 0; k < c->n_in[i]; k++) c->in[i][k] = middle(&c->signals[i].at[k]);
   return run_graph(c); /* a first step, discarded: a wrong shape shows now, and code and weights are warm */
 }
 
-/* One step on given[SP], [PV], [DV], [MV] (the MV that the plant received). The state stays as it was if refused. */
+/* One step on given[SP], [PV], [DV], [MV] (the MV that the plant received), c->operate and c->fresh. The state stays as
+   it was if refused. A PV that is not fresh must be finite all the same. */
 static Outcome controller_step(Controller *c, const double *const given[STATE]) {
+  for (size_t k = 0; c->uses[FRESH] && k < c->n_in[FRESH]; k++) {
+    if (c->fresh[k] == 0 || c->fresh[k] == 1) continue;
+    failed(c, "fresh of %s is %g; it is 1 for a new and good reading, or 0", c->signals[PV].at[k].name, c->fresh[k]);
+    return REFUSED_INPUT;
+  }
   for (int i = 0; i < INPUTS; i++) {
-    const double *values = i == STATE ? c->state : given[i];
+    const double *values = i == STATE ? c->state : i == OPERATE ? c->operate : i == FRESH ? c->fresh : given[i];
     if (c->uses[i] && c->n_in[i] && !values) {
       failed(c, "%s is missing; no MV is computed without it", INPUT[i]);
       return REFUSED_INPUT;
@@ -548,6 +653,7 @@ static Outcome controller_step(Controller *c, const double *const given[STATE]) 
 
 /* ------------------------------------------------------------------ the loop: modes, limits, faults */
 #define PV_MARGIN 0.05        /* share of a PV's range beyond which the sensor is broken */
+#define BRIDGE_PERIODS 10     /* a law's own prediction is as good as its model, and loads go on unseen meanwhile */
 #define READ_BACK_MARGIN 0.02 /* share of an MV's range by which scaling may carry a sound read-back over its ends */
 
 typedef enum { MANUAL, AUTO, HOLD } Mode; /* the MV is the operator's, the law's, the last one after a fault */
@@ -567,6 +673,13 @@ typedef struct {
   bool lost;      /* the last command did not reach the plant, and nothing has told since where the MV stands */
   double max_gap; /* missed periods in a row after which the law starts cold */
   double *sp, *mv, *applied, *before; /* mv is NAN while nobody knows where it stands */
+  /* By PV, for a law that reads fresh: the last good number, periods since then, whether it is bad, predicted, or left
+     out of what the law controls now, and whether the loop holds rather than leave it out (set it yourself). */
+  double *last, *gone;
+  bool *bad, *bridged, *shed, *critical;
+  double bridge_s; /* for so long a bad reading is predicted */
+  double *pv;      /* numbers for the law */
+  double *told;    /* fresh and operate as they were set, while a step has others */
   double *wanted; /* where an operator sent the MV, while by_hand: it goes there by at most its max_move a period */
   bool by_hand;
   char reason[WORDS]; /* of the last scan; empty: no fault */
@@ -577,7 +690,17 @@ typedef struct {
 static bool loop_writes(const Loop *l) { return !isnan(l->mv[0]) && !l->lost; }
 
 static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
-  *l = (Loop){.c = c, .mode = mode, .recover_after = recover_after, .max_gap = 3};
+  size_t n = c->n_in[PV] + 1;
+  *l = (Loop){.c = c, .mode = mode, .recover_after = recover_after, .max_gap = 3, .bridge_s = BRIDGE_PERIODS * c->period_s};
+  l->last = calloc(n, sizeof *l->last);
+  l->gone = calloc(n, sizeof *l->gone);
+  l->bad = calloc(n, sizeof *l->bad);
+  l->bridged = calloc(n, sizeof *l->bridged);
+  l->shed = calloc(n, sizeof *l->shed);
+  l->critical = calloc(n, sizeof *l->critical);
+  l->pv = calloc(n, sizeof *l->pv);
+  l->told = calloc(n + c->n_in[OPERATE], sizeof *l->told);
+  for (size_t i = 0; l->last && i < n; i++) l->last[i] = NAN;
   l->sp = calloc(c->n_in[SP] + 1, sizeof *l->sp);
   l->mv = calloc(c->n_in[MV] + 1, sizeof *l->mv);
   l->applied = calloc(c->n_in[MV] + 1, sizeof *l->applied);
@@ -585,7 +708,8 @@ static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
   l->wanted = calloc(c->n_in[MV] + 1, sizeof *l->wanted);
   for (size_t i = 0; l->sp && i < c->n_in[SP]; i++) l->sp[i] = middle(&c->signals[SP].at[i]);
   for (size_t i = 0; l->mv && i < c->n_in[MV]; i++) l->mv[i] = NAN;
-  return l->sp && l->mv && l->applied && l->before && l->wanted;
+  return l->sp && l->mv && l->applied && l->before && l->wanted && l->last && l->gone && l->bad && l->bridged && l->shed &&
+         l->critical && l->pv && l->told;
 }
 
 static void loop_close(Loop *l) {
@@ -594,6 +718,14 @@ static void loop_close(Loop *l) {
   free(l->applied);
   free(l->before);
   free(l->wanted);
+  free(l->last);
+  free(l->gone);
+  free(l->bad);
+  free(l->bridged);
+  free(l->shed);
+  free(l->critical);
+  free(l->pv);
+  free(l->told);
 }
 
 /* Set points (SP); or the MV (MV) from an operator in MANUAL, to which it goes by at most its max_move a period, or that the plant has, while it is not known. False, and
@@ -637,8 +769,14 @@ static void loop_set_mode(Loop *l, Mode mode) {
   l->good = 0;
 }
 
+/* Periods without readings. */
+static void loop_missed(Loop *l, double periods) {
+  for (size_t k = 0; k < l->c->n_in[PV]; k++) l->gone[k] += periods;
+}
+
 /* So many periods passed without a scan. */
 static void loop_gap(Loop *l, double periods) {
+  loop_missed(l, periods);
   if (periods > l->max_gap) controller_cold(l->c);
 }
 
@@ -676,21 +814,25 @@ static void clip(const Controller *c, const double *applied, double *to) {
   for (size_t k = 0; k < c->n_in[MV]; k++) to[k] = fmin(fmax(applied[k], s[k].low), s[k].high);
 }
 
-/* Why not to act on a sample, in c->words; true if there is no reason. */
-static bool trusted(Controller *c, const Sample *sample) {
+/* Why not to act on a sample, in c->words; true if there is no reason. `bad` takes what speaks against single PVs alone;
+   NULL: it speaks against the sample. */
+static bool trusted(Controller *c, const Sample *sample, bool *bad) {
   const double *const values[STATE] = {[PV] = sample->pv, [DV] = sample->dv};
   for (int i = PV; i <= DV; i++) {
     if (i == DV && !c->uses[DV]) continue;
     if (!values[i] && c->n_in[i]) return failed(c, "the sample has no %s", INPUT[i]);
-    for (size_t k = 0; k < c->n_in[i]; k++)
-      if (!isfinite(values[i][k])) return failed(c, "%s %s is %g", INPUT[i], c->signals[i].at[k].name, values[i][k]);
+    for (size_t k = 0; k < c->n_in[i]; k++) {
+      bool wrong = !isfinite(values[i][k]) || (i == PV && bad && !may_be(&c->signals[PV].at[k], values[PV][k], PV_MARGIN));
+      if (i == PV && bad) bad[k] = wrong;
+      else if (wrong) return failed(c, "%s %s is %g", INPUT[i], c->signals[i].at[k].name, values[i][k]);
+    }
   }
   size_t wrong = sample->mv_applied ? implausible(c, sample->mv_applied) : c->n_in[MV];
   if (wrong < c->n_in[MV]) {
     const Signal *s = &c->signals[MV].at[wrong];
     return failed(c, "applied MV %s is %g %s, which no actuator can hold", s->name, sample->mv_applied[wrong], s->unit);
   }
-  for (size_t k = 0; k < c->n_in[PV]; k++) {
+  for (size_t k = 0; !bad && k < c->n_in[PV]; k++) {
     const Signal *s = &c->signals[PV].at[k];
     if (!may_be(s, sample->pv[k], PV_MARGIN))
       return failed(c, "PV %s is %g %s, outside its range", s->name, sample->pv[k], s->unit);
@@ -713,10 +855,68 @@ static void loop_found(Loop *l, const double *applied, bool good_one) {
     clip(l->c, applied, l->mv);
 }
 
+/* The place in operate of a PV's use; n_in[OPERATE] where it has none. */
+static size_t use_of(const Controller *c, size_t pv) {
+  char name[WORDS];
+  snprintf(name, sizeof name, "%.256s.use", c->signals[PV].at[pv].name);
+  size_t i = operate_place(c, name);
+  return i < c->n_in[OPERATE] && c->operate_entries[i].of_cv ? i : c->n_in[OPERATE];
+}
+
+/* Judge PVs with bad readings, predicted or left out, and put the numbers for the law into l->pv. A law that reads fresh
+   goes on without a PV whose reading is bad: for bridge_s it predicts the PV, then its use is 0 until the reading is
+   good again. False where no PV is left that is in use, where one is gone for longer that is critical or has
+   no use, and where one was never read. */
+static bool loop_bridge(Loop *l, const double *pv) {
+  Controller *c = l->c;
+  size_t n = c->n_in[PV], first = n;
+  bool left = false, any = false;
+  for (size_t k = 0; k < n; k++) {
+    l->gone[k] = l->bad[k] ? l->gone[k] + 1 : 0;
+    if (!l->bad[k]) l->last[k] = pv[k];
+    l->pv[k] = l->last[k];
+  }
+  for (size_t k = 0; k < n; k++) {
+    const char *name = c->signals[PV].at[k].name;
+    size_t use = use_of(c, k);
+    if (l->bad[k] && isnan(l->last[k])) return failed(c, "PV %s is %g; it has not been read yet", name, pv[k]);
+    l->bridged[k] = l->bad[k] && (l->gone[k] - 1) * c->period_s < l->bridge_s;
+    l->shed[k] = l->bad[k] && !l->bridged[k];
+    if (l->shed[k] && l->critical[k]) return failed(c, "PV %s is %g; the loop needs this PV", name, pv[k]);
+    if (l->shed[k] && use == c->n_in[OPERATE]) return failed(c, "PV %s is %g; the law cannot leave this PV out", name, pv[k]);
+    if (l->shed[k] && first == n) first = k;
+    bool wanted = use < c->n_in[OPERATE] && c->operate[use] > 0;
+    any = any || wanted;
+    left = left || (wanted && !l->shed[k]);
+  }
+  if (first < n && any && !left)
+    return failed(c, "PV %s is %g; no controlled variable is left", c->signals[PV].at[first].name, pv[first]);
+  return true;
+}
+
+/* A step with bad PVs not fresh, and those that are left out not in use. */
+static Outcome loop_step(Loop *l, const double *const given[STATE]) {
+  Controller *c = l->c;
+  size_t n = c->n_in[PV], m = c->n_in[OPERATE];
+  if (!c->uses[FRESH]) return controller_step(c, given);
+  memcpy(l->told, c->fresh, n * sizeof *l->told);
+  memcpy(l->told + n, c->operate, m * sizeof *l->told);
+  for (size_t k = 0; k < n; k++) {
+    if (l->bad[k]) c->fresh[k] = 0;
+    if (l->shed[k]) c->operate[use_of(c, k)] = 0;
+  }
+  Outcome outcome = controller_step(c, given);
+  memcpy(c->fresh, l->told, n * sizeof *l->told);
+  memcpy(c->operate, l->told + n, m * sizeof *l->told);
+  return outcome;
+}
+
 static void loop_take(Loop *l, const Sample *sample) {
   Controller *c = l->c;
   size_t n = c->n_in[MV];
-  bool good_one = sample && trusted(c, sample);
+  bool apart = c->uses[FRESH], good_one = sample && trusted(c, sample, apart ? l->bad : NULL);
+  if (!good_one) loop_missed(l, 1);
+  else if (apart) good_one = loop_bridge(l, sample->pv);
   if (sample) loop_found(l, sample->mv_applied, good_one);
   memcpy(l->before, l->mv, n * sizeof *l->mv);
   if (!good_one) {
@@ -729,8 +929,8 @@ static void loop_take(Loop *l, const Sample *sample) {
   }
   clip(c, sample->mv_applied ? sample->mv_applied : l->mv, l->applied);
   if (!loop_writes(l)) memcpy(l->mv, l->applied, n * sizeof *l->mv);
-  const double *const given[STATE] = {[SP] = l->sp, [PV] = sample->pv, [DV] = sample->dv, [MV] = l->applied};
-  if (controller_step(c, given) != STEPPED) {
+  const double *const given[STATE] = {[SP] = l->sp, [PV] = apart ? l->pv : sample->pv, [DV] = sample->dv, [MV] = l->applied};
+  if (loop_step(l, given) != STEPPED) {
     if (l->mode == AUTO) memcpy(l->mv, l->applied, n * sizeof *l->mv);
     loop_fault(l, c->words);
     return;
@@ -788,12 +988,31 @@ static void sleep_until(double at) {
   }
 }
 
+/* Take NAME=VALUE of operate, all together: each must be allowed beside the others. */
+static bool operate_words(Controller *c, char **words, int n) {
+  double *values = calloc(c->n_in[OPERATE] + 1, sizeof *values);
+  bool known = values || failed(c, "no memory");
+  if (known) memcpy(values, c->operate, c->n_in[OPERATE] * sizeof *values);
+  for (int k = 0; known && k < n; k++) {
+    char name[WORDS], *sign = strrchr(words[k], '='), *end = NULL;
+    snprintf(name, sizeof name, "%.*s", sign ? (int)(sign - words[k]) : 0, words[k]);
+    size_t i = operate_place(c, name);
+    double value = sign ? strtod(sign + 1, &end) : NAN;
+    if (!sign || end == sign + 1 || *end) known = failed(c, "%.200s is not NAME=VALUE", words[k]);
+    else if (i == c->n_in[OPERATE]) known = failed(c, "operate has no entry %.200s", name);
+    else values[i] = value;
+  }
+  known = known && controller_operate(c, values);
+  free(values);
+  return known;
+}
+
 /* Scan at start + k period: lateness never becomes drift, and a period that has passed whole is skipped. */
-static int control(const char *path, long scans, double period) {
+static int control(const char *path, long scans, double period, char **words, int n_words) {
   Controller c;
   Loop loop = {0};
   int status = 2;
-  if (!controller_open(&c, path) || !loop_open(&loop, &c, AUTO, 5)) {
+  if (!controller_open(&c, path) || !operate_words(&c, words, n_words) || !loop_open(&loop, &c, AUTO, 5)) {
     fprintf(stderr, "error: %s\n", c.words);
   } else {
     Plant plant = {&c, calloc(c.n_in[PV] + 1, sizeof(double)), calloc(c.n_in[DV] + 1, sizeof(double)),
@@ -858,7 +1077,7 @@ static void put(FILE *out, const char *name, const double *values, size_t n, con
   fprintf(out, "]%s", after);
 }
 
-static bool kit_step(Controller *c, Run run, const Json *row, const Json *scale, double *room[STATE], FILE *out, Tally *t) {
+static bool kit_step(Controller *c, Run run, const Json *row, const Json *scale, double *room[INPUTS], FILE *out, Tally *t) {
   const double *given[STATE] = {0};
   for (int i = 0; i < STATE; i++)
     if (c->uses[i] && !(given[i] = numbers(json_get(json_get(row, "given"), INPUT[i]), c->n_in[i], room[i])))
@@ -867,6 +1086,13 @@ static bool kit_step(Controller *c, Run run, const Json *row, const Json *scale,
   bool begin = run == ONE_STEP || (begins && begins->kind == J_TRUE);
   if (begin && !numbers(json_get(json_get(row, "given"), "state"), c->n_in[STATE], c->state))
     return failed(c, "a step of the kit lacks its state");
+  if (c->uses[OPERATE]) {
+    const double *values = numbers(json_get(json_get(row, "given"), "operate"), c->n_in[OPERATE], room[OPERATE]);
+    if (!values) return failed(c, "a step of the kit lacks operate");
+    if (!controller_operate(c, values)) return false;
+  }
+  if (c->uses[FRESH] && !numbers(json_get(json_get(row, "given"), "fresh"), c->n_in[FRESH], c->fresh))
+    return failed(c, "a step of the kit lacks fresh");
   static const char *const BECAUSE[] = {"", "input", "output"};
   double began = seconds();
   Outcome outcome = controller_step(c, given);
@@ -884,7 +1110,7 @@ static bool kit_step(Controller *c, Run run, const Json *row, const Json *scale,
   return true;
 }
 
-static bool kit_scan(Loop *l, const Json *row, const Json *scale, double *room[STATE], FILE *out, Tally *t) {
+static bool kit_scan(Loop *l, const Json *row, const Json *scale, double *room[INPUTS], FILE *out, Tally *t) {
   Controller *c = l->c;
   const Json *given = json_get(row, "sample");
   for (int i = 0; i < 3; i++)
@@ -893,8 +1119,10 @@ static bool kit_scan(Loop *l, const Json *row, const Json *scale, double *room[S
   if (unwritten && unwritten->kind == J_TRUE) loop_unwritten(l, "the plant cannot be written");
   double missed = json_number(json_get(row, "missed"));
   if (missed > 0) loop_gap(l, missed);
-  Sample sample = {numbers(json_get(given, "pv"), c->n_in[PV], room[PV]), numbers(json_get(given, "dv"), c->n_in[DV], room[DV]),
-                   numbers(json_get(given, "mv_applied"), c->n_in[MV], room[MV]), json_number(json_get(given, "age_s"))};
+  Sample sample = {.pv = numbers(json_get(given, "pv"), c->n_in[PV], room[PV]),
+                   .dv = numbers(json_get(given, "dv"), c->n_in[DV], room[DV]),
+                   .mv_applied = numbers(json_get(given, "mv_applied"), c->n_in[MV], room[MV]),
+                   .age_s = json_number(json_get(given, "age_s"))};
   bool read = given && given->kind == J_OBJECT;
   if (read && (!sample.pv || !sample.dv)) return failed(c, "a scan of the kit lacks pv or dv");
   loop_scan(l, read ? &sample : NULL);
@@ -917,13 +1145,16 @@ static int by_size(const void *a, const void *b) {
 static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t) {
   const Json *steps = json_get(kit, "steps"), *scans = json_get(kit, "scans"), *scale = json_get(kit, "scale");
   const Json *begin = json_get(kit, "loop");
-  double *room[STATE] = {0};
+  double *room[INPUTS] = {0};
   bool done = steps && scans && steps->kind == J_LIST && scans->kind == J_LIST && steps->n > 0;
   if (!done) failed(c, "the kit has no steps and scans");
   if (done && strcmp(json_word(kit, "sha256"), c->digest))
     done = failed(c, "the kit is of another controller file");
   if (done && !(t->us = calloc(RUNS * steps->n, sizeof *t->us))) done = failed(c, "no memory");
-  for (int i = 0; i < STATE; i++) room[i] = calloc(c->n_in[i] + 1, sizeof **room);
+  for (int i = 0; i < INPUTS; i++) {
+    room[i] = calloc(c->n_in[i] + 1, sizeof **room);
+    if (done && !room[i]) done = failed(c, "no memory");
+  }
   const char *version = OrtGetApiBase()->GetVersionString();
   if (out && done)
     fprintf(out, "{\"host\": \"C\", \"onnxruntime\": \"%s\", \"sha256\": \"%s\"", version, json_word(kit, "sha256"));
@@ -936,6 +1167,8 @@ static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t
     if (out) fprintf(out, "]");
   }
   controller_cold(c);
+  for (size_t k = 0; k < c->n_in[OPERATE]; k++) c->operate[k] = c->operate_entries[k].standard; /* of all scans */
+  for (size_t k = 0; k < c->n_in[FRESH]; k++) c->fresh[k] = 1;
   if (done) {
     l->recover_after = (int)json_number(json_get(begin, "recover_after"));
     l->max_gap = json_number(json_get(begin, "max_gap"));
@@ -956,7 +1189,7 @@ static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t
   if (done)
     printf("C, onnxruntime %s: %zu steps, %zu scans, largest difference %.3g, chained %.3g, %d wrong, step p50 %.1f us\n",
            version, steps->n, scans->n, t->largest[ONE_STEP], t->largest[CHAINED], t->wrong, p50);
-  for (int i = 0; i < STATE; i++) free(room[i]);
+  for (int i = 0; i < INPUTS; i++) free(room[i]);
   free(t->us);
   return done;
 }
@@ -995,9 +1228,10 @@ static int conformance(const char *folder, const char *answers) {
 
 int main(int n, char **words) {
   if (n >= 3 && n <= 4 && !strcmp(words[1], "--conformance")) return conformance(words[2], n > 3 ? words[3] : NULL);
-  if (n >= 2 && n <= 4 && words[1][0] != '-')
-    return control(words[1], n > 2 ? strtol(words[2], NULL, 10) : 20, n > 3 ? strtod(words[3], NULL) : 0);
-  fprintf(stderr, "usage: host FILE.onnx [SCANS [PERIOD_S]] | host --conformance KIT [ANSWERS.json]\n");
+  if (n >= 2 && words[1][0] != '-')
+    return control(words[1], n > 2 ? strtol(words[2], NULL, 10) : 20, n > 3 ? strtod(words[3], NULL) : 0,
+                   n > 4 ? words + 4 : NULL, n > 4 ? n - 4 : 0);
+  fprintf(stderr, "usage: host FILE.onnx [SCANS [PERIOD_S [NAME=VALUE ...]]] | host --conformance KIT [ANSWERS.json]\n");
   return 2;
 }
 #endif

@@ -8,7 +8,8 @@ import json
 import re
 import shutil
 import zipfile
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -22,7 +23,7 @@ from loopwright.pipeline.plants.fmu.instance import Instance
 from loopwright.serving.conformance.steps import answered
 from loopwright.serving.controller import Controller
 from loopwright.serving.controller_file import file_digest
-from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.manifest import Manifest, Signal, What
 
 LOG = {
     "logStatusError": "why a call failed",
@@ -39,6 +40,12 @@ last MV is held and the law's state stays as it was, until a sample is accepted 
 APPLIED = """<p><code>mv_applied</code> is the MV that the plant received. Until it is set in a step, and wherever the
 parameter <code>use_mv_applied</code> is false, the FMU's own last MV takes its place. A tool that writes a value, as 0,
 to an input without a connection needs <code>use_mv_applied</code> = false.</p>"""
+
+
+OPERATED = """<p><code>operate.NAME</code> is what operators may change: a tunable parameter, which may be set before
+any communication step. A value outside its range is refused where it is set, a low end above its high one at the end
+of the initialization and at the next step. <code>fresh.NAME</code> is 1 for a process variable whose reading is new
+and good, 0 for one that is neither; these inputs are read where the parameter <code>use_fresh</code> is true.</p>"""
 
 
 def token_of(controller: Controller) -> str:
@@ -97,10 +104,10 @@ def page(controller: Controller) -> bytes:
         for r in rows
     )
     title = html.escape(words_of(controller))
-    applied = APPLIED if "mv_applied" in m.inputs else ""
+    further = [words for name, words in (("mv_applied", APPLIED), ("operate", OPERATED)) if name in m.inputs]
     return (
         f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title>\n<h1>{title}</h1>\n'
-        f"{SAMPLING.format(period=m.period_s)}\n{applied}\n"
+        f"{SAMPLING.format(period=m.period_s)}\n{chr(10).join(further)}\n"
         "<table>\n<tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>what it is</th>"
         f"</tr>\n{cells}</table>\n<p>The FMU holds onnxruntime's library of one platform. sources/ has what was"
         " compiled for it; the licences are in licenses/.</p>\n</html>\n"
@@ -144,6 +151,7 @@ def _start_of(output: ScalarVariable, rows: list[ScalarVariable]) -> list[Scalar
 
 def _common(row: ScalarVariable) -> dict[str, str]:
     varies = {"output": "discrete", "parameter": "fixed"}.get(row.causality, "continuous")
+    varies = {"operate": "tunable", "fresh": "discrete"}.get(row.group, varies)  # a tool interpolates no flag
     found = {"name": row.name, "valueReference": str(row.reference), "causality": row.causality, "variability": varies}
     return found | {"description": row.words} | ({"initial": "calculated"} if row.causality == "output" else {})
 
@@ -224,14 +232,16 @@ def _write_controller(controller: Controller, resources: Path) -> None:
 
 
 TIME, FAULT, USE_APPLIED, FIRST = range(4)  # value references; FIRST: of the first signal
+BOOLEANS = frozenset({"fault", "use_mv_applied", "use_fresh"})
 READ_BACK = "the MV that the plant received over the last period"
 NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True, slots=True)
 class ScalarVariable:
-    """A scalar variable. ``group``: sp, pv, dv, mv_applied, mv_start, mv, info; time, fault or use_mv_applied.
+    """A scalar variable.
 
+    ``group``: sp, pv, dv, mv_applied, mv_start, mv, info, operate, fresh; time, fault, use_mv_applied or use_fresh.
     ``low``, ``high`` and ``start`` are None where there is none.
     """
 
@@ -248,7 +258,7 @@ class ScalarVariable:
     @property
     def boolean(self) -> bool:
         """Whether it is a Boolean; else it is real."""
-        return self.reference in (FAULT, USE_APPLIED)
+        return self.group in BOOLEANS
 
 
 def variables_of(m: Manifest) -> list[ScalarVariable]:
@@ -278,11 +288,43 @@ def variables_of(m: Manifest) -> list[ScalarVariable]:
             ScalarVariable(in_xml(f"info.{name}"), reference, "info", "output", "of the law, for people and alarms")
         )
         reference += 1
+    for row in _steering(m):
+        rows.append(replace(row, reference=reference))
+        reference += 1
     names = [row.name for row in rows]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise HostError(f"two variables of the FMU would be named {twice!r}; an FMU's names must be different")
     return rows
+
+
+OPERATED_WORDS: Mapping[What, str] = {
+    "use": "1: the law takes it into account, 0: it is out",
+    "track": "1: the set point is wanted, 0: the range alone",
+    "low": "low end of the range in which it may be",
+    "high": "high end of the range in which it may be",
+    "rank": "1: its range is kept before those of 2",
+    "max_move": "largest move a period",
+    "rest": "where it goes that nothing asks for",
+    "rest_use": "1: it goes to its rest, 0: it has none",
+    "cost": "per unit and period, beside the other costs",
+    "speed": "multiplies the law's",
+    "caution": "multiplies the law's",
+}
+
+
+def _steering(m: Manifest) -> Iterator[ScalarVariable]:
+    """``operate`` and ``fresh`` of a law that reads them. They stand last: no other variable has another reference."""
+    for e in m.operate if "operate" in m.inputs else ():
+        name, unit = in_xml(f"operate.{e.name}"), "" if e.unit == "-" else in_xml(e.unit)
+        words = OPERATED_WORDS[e.what]
+        yield ScalarVariable(name, 0, "operate", "parameter", words, unit, e.low, e.high, e.default)
+    if "fresh" in m.inputs:
+        words = "1: its reading is new and good, 0: it is neither; read where use_fresh is true"
+        for s in m.pv:
+            yield ScalarVariable(in_xml(f"fresh.{s.name}"), 0, "fresh", "input", words, "", 0.0, 1.0, 1.0)
+        words = "whether fresh is read; otherwise all readings are"
+        yield ScalarVariable("use_fresh", 0, "use_fresh", "parameter", words, start=False)
 
 
 def _variable(s: Signal, reference: int, group: str, causality: str, words: str) -> ScalarVariable:
@@ -315,7 +357,7 @@ def check(controller: Controller, fmu: Path, folder: Path) -> int:
     steps = answered(controller)
     for number, answer in enumerate(steps):
         if answer.given.cold:
-            instance.begin()
+            instance.begin(_references(rows, "use_fresh"))
             k = 0
         values = np.concatenate([answer.given.inputs[name] for name in groups])
         instance.step(given_to, values, k * period, period)

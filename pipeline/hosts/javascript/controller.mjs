@@ -10,7 +10,7 @@ export class Refused extends Error {
   }
 }
 
-const INPUTS = ["sp", "pv", "dv", "mv_applied", "state"];
+const INPUTS = ["sp", "pv", "dv", "mv_applied", "state", "operate", "fresh"];
 const OUTPUTS = ["mv", "state_next", "info"];
 const hex = (bytes) => [...new Uint8Array(bytes)].map((b) => b.toString(16).padStart(2, "0")).join("");
 const same = (a, b) => [...a].sort().join() === [...b].sort().join();
@@ -18,7 +18,46 @@ const same = (a, b) => [...a].sort().join() === [...b].sort().join();
 const MOVE_ROUNDING = 1e-9; // share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
 
 // Entries that a host acts on. They must stand in the .json too: whoever changed that one would else be shown other ranges.
-const ACTED_ON = ["schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv"];
+const ACTED_ON = ["schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv", "operate"];
+
+const SWITCHES = ["use", "track", "rest_use"];
+
+// The manifest's entries of `operate`, which operators may change, each by its name, as "y0.low" or "speed".
+export class Operate {
+  constructor(entries = []) {
+    this.entries = entries.map((e) => ({ ...e, name: e.signal ? `${e.signal}.${e.what}` : e.what }));
+    this.default = this.entries.map((e) => e.default);
+  }
+
+  // `base` (the defaults) with some values by name, {"y0.low": 40}; Refused for an unknown name or a value that is not allowed.
+  withValues(values, base = this.default) {
+    const found = [...base];
+    for (const [name, value] of Object.entries(values)) {
+      const i = this.entries.findIndex((e) => e.name === name);
+      if (i < 0) throw new Refused(`operate has no entry ${name}; it has ${this.entries.map((e) => e.name).join(", ") || "none"}`, "input");
+      found[i] = value;
+    }
+    return this.checked(found);
+  }
+
+  // The values, in the order of the entries; Refused names the first that is outside its engineered range, a switch that is
+  // neither 0 nor 1, or a low end above the high one.
+  checked(values) {
+    if (values?.length !== this.entries.length) throw new Refused(`operate has ${values?.length ?? "no"} values; it needs ${this.entries.length}`, "input");
+    this.entries.forEach((e, i) => {
+      const value = values[i], binary = SWITCHES.includes(e.what);
+      if (typeof value === "number" && e.low <= value && value <= e.high && (!binary || value === 0 || value === 1)) return;
+      const allowed = binary && e.low < e.high ? "0 or 1" : `${short(e.low)} to ${short(e.high)} ${e.unit}`.trimEnd();
+      throw new Refused(`operate: ${e.name} is ${Number.isFinite(value) ? short(value) : word(value)}; allowed is ${allowed}`, "input");
+    });
+    this.entries.forEach((e, i) => {
+      const above = e.what === "low" ? this.entries.findIndex((other) => other.signal === e.signal && other.what === "high") : i;
+      if (values[i] > values[above])
+        throw new Refused(`operate: ${e.name} is ${short(values[i])}, above ${this.entries[above].name} = ${short(values[above])}; a low end must not be above the high one`, "input");
+    });
+    return [...values];
+  }
+}
 
 export class Controller {
   // `bytes` is the .onnx file, `manifest` the parsed .json beside it; the digest ties one to the other, and the ranges are
@@ -47,7 +86,7 @@ export class Controller {
   }
 
   constructor(ort, session, manifest) {
-    Object.assign(this, { session, manifest, buffers: {}, feeds: {} });
+    Object.assign(this, { session, manifest, buffers: {}, feeds: {}, operate: new Operate(manifest.operate) });
     this.signals = { sp: manifest.sp, pv: manifest.pv, dv: manifest.dv, mv_applied: manifest.mv };
     const sizes = { mv: manifest.mv.length, state_next: manifest.n_state, info: manifest.info.length };
     if (!same(session.inputNames, manifest.inputs) || !same(session.outputNames, OUTPUTS.filter((name) => sizes[name])))
@@ -56,7 +95,7 @@ export class Controller {
     if (limited && !manifest.inputs.includes("mv_applied"))
       throw new Refused(`the moves of ${limited.name} are limited, but its law does not read mv_applied`);
     for (const name of INPUTS.filter((n) => manifest.inputs.includes(n))) {
-      const n = name === "state" ? manifest.n_state : this.signals[name].length;
+      const n = { state: manifest.n_state, operate: this.operate.entries.length, fresh: manifest.pv.length }[name] ?? this.signals[name].length;
       this.buffers[name] = new Float64Array(n);
       this.feeds[name] = new ort.Tensor("float64", this.buffers[name], [n]);
     }
@@ -69,9 +108,11 @@ export class Controller {
 
   // One step: {sp, pv, dv, mv_applied, state} -> {mv, state_next, info}; Refused where no MV may be computed or used.
   // Keep state_next for the next step, and the old state after a refusal. One step at a time.
+  // `operate` may be given, in the order of its entries (else: the defaults), and `fresh`, 1 for each PV whose reading is
+  // new and good, else 0 (else: all are). A PV that is not fresh must be finite all the same.
   async step(given) {
     for (const [name, buffer] of Object.entries(this.buffers)) {
-      const values = given[name];
+      const values = this.#steered(name, given[name]);
       if (values?.length !== buffer.length) throw new Error(`${name} has ${values?.length} values; it needs ${buffer.length}`);
       const bad = values.findIndex((value) => !Number.isFinite(value));
       if (bad >= 0) {
@@ -85,6 +126,16 @@ export class Controller {
     const [mv, state_next, info] = OUTPUTS.map((name) => Float64Array.from(result[name]?.data ?? []));
     this.#refuse({ mv, state_next, info });
     return { mv, state_next, info };
+  }
+
+  // Defaults where there is none, and what is wrong with a given one.
+  #steered(name, values) {
+    if (name === "operate") return values ? this.operate.checked(values) : this.operate.default;
+    if (name !== "fresh") return values;
+    if (!values) return this.manifest.pv.map(() => 1);
+    const bad = Array.from(values).findIndex((value) => value !== 0 && value !== 1);
+    if (bad >= 0) throw new Refused(`fresh of ${this.manifest.pv[bad]?.name} is ${String(values[bad])}; it is 1 for a new and good reading, or 0`, "input");
+    return values;
   }
 
   #refuse(outputs) {
@@ -159,17 +210,63 @@ const limits = (s) => Boolean(s.max_move && !s.values);
 const PV_MARGIN = 0.05; // share of a PV's range beyond which the sensor is broken
 const READ_BACK_MARGIN = 0.02; // share of an MV's range by which scaling may carry a sound read-back over its ends
 const DIGITS = 6;
+const BRIDGE_PERIODS = 10; // a law's own prediction is as good as its model, and loads go on unseen meanwhile
 const UNKNOWN = "there is no read-back, so where the MV stands is not known and nothing is written";
+
+// Bad readings of single PVs. A law that reads `fresh` goes on without a PV whose reading is bad: for bridgeS seconds it predicts
+// the PV, then the PV is shed: its `use` is 0 for the law until the reading is good again. The sample is refused where no
+// PV is left that the operator has in use, and where a PV is gone for longer that is critical or has no `use`.
+class Bridging {
+  constructor(manifest, bridgeS, critical) {
+    Object.assign(this, { m: manifest, bridgeS: bridgeS ?? BRIDGE_PERIODS * manifest.period_s, critical });
+    this.last = manifest.pv.map(() => NaN); // the last good number of each PV
+    this.gone = manifest.pv.map(() => 0); // periods since then, the present one included
+    const uses = (manifest.operate ?? []).map((e, i) => [e, i]).filter(([e]) => e.group === "cv" && e.what === "use");
+    this.useOf = new Map(uses.map(([e, i]) => [e.signal, i]));
+  }
+
+  missed(periods = 1) {
+    this.gone = this.gone.map((n) => n + periods);
+  }
+
+  // {reason} of a refusal, or {pv, fresh, operate, bridged, shed}: what the law gets, and why a PV's reading is not used.
+  // `bad` says for each PV why its reading is bad, or is empty.
+  look({ pv, fresh }, bad, operate) {
+    this.last = this.last.map((value, i) => (bad[i] ? value : pv[i]));
+    this.gone = this.gone.map((n, i) => (bad[i] ? n + 1 : 0));
+    const bridged = {}, shed = {}, used = [...operate];
+    for (const [i, s] of this.m.pv.entries()) {
+      if (!bad[i]) continue;
+      if (Number.isNaN(this.last[i])) return { reason: `${bad[i]}; it has not been read yet` };
+      if ((this.gone[i] - 1) * this.m.period_s < this.bridgeS) bridged[s.name] = bad[i];
+      else if (this.critical.includes(s.name)) return { reason: `${bad[i]}; the loop needs this PV` };
+      else if (!this.useOf.has(s.name)) return { reason: `${bad[i]}; the law cannot leave this PV out` };
+      else (shed[s.name] = bad[i]), (used[this.useOf.get(s.name)] = 0);
+    }
+    const wanted = [...this.useOf].filter(([, i]) => operate[i] > 0);
+    if (Object.keys(shed).length && wanted.length && wanted.every(([name]) => name in shed))
+      return { reason: `${Object.values(shed)[0]}; no controlled variable is left` };
+    return {
+      reason: "", bridged, shed, operate: used,
+      pv: pv.map((value, i) => (bad[i] ? this.last[i] : value)),
+      fresh: this.m.pv.map((_, i) => (bad[i] ? 0 : fresh?.[i] ?? 1)),
+    };
+  }
+}
 
 export class Loop {
   // mode: MANUAL the operator's MV, AUTO the law's, HOLD the last one after a fault. `sp` and `mv` lie in their ranges.
   // `mv` is what the plant has now; null: not known, so nothing is written until a good sample has a read-back.
   // recoverAfter: good samples after which HOLD returns to AUTO; null: only the operator returns it.
-  constructor(controller, { sp, mv = null, mode = "MANUAL", recoverAfter = null, maxGap = 3 }) {
+  // bridgeS, critical: seconds for which the bad reading of a PV is bridged (ten periods), and names of PVs without which the
+  // loop holds after that; of a law that reads `fresh`.
+  constructor(controller, { sp, mv = null, mode = "MANUAL", recoverAfter = null, maxGap = 3, bridgeS = null, critical = [] }) {
     Object.assign(this, { controller, mode, recoverAfter, maxGap, fault: "", good: 0, state: controller.cold() });
+    this.bridging = new Bridging(controller.manifest, bridgeS, critical);
     this.lost = false; // the last command did not reach the plant, and nothing has told since where the MV stands
     this.sp = within(sp, controller.manifest.sp, "set point");
     this.mv = this.before = mv && within(mv, controller.manifest.mv, "MV");
+    this.operate = controller.operate.default; // what operators have changed, see setOperate
     this.wanted = null; // where an operator sent the MV: it goes there by at most its max_move a period
   }
 
@@ -182,6 +279,11 @@ export class Loop {
     this.sp = within(sp, this.controller.manifest.sp, "set point");
   }
 
+  // Values of `operate` by name, {"y0.low": 40, "y0.high": 60}; Refused, and nothing changed, where one is not allowed.
+  setOperate(values) {
+    this.operate = this.controller.operate.withValues(values, this.operate);
+  }
+
   setMv(mv) {
     if (this.mode !== "MANUAL") throw new Refused(`the MV is set by hand in MANUAL only; the loop is in ${this.mode}`);
     if (this.lost) throw new Refused("the last MV did not reach the plant, so where the MV stands is not known; wait");
@@ -190,26 +292,33 @@ export class Loop {
     else this.mv = wanted;
   }
 
-  // Another controller takes over; it has no past.
+  // Another controller takes over; it has no past, and the defaults of its own `operate`.
   replace(controller) {
-    Object.assign(this, { controller, state: controller.cold() });
+    Object.assign(this, { controller, state: controller.cold(), operate: controller.operate.default });
+    this.bridging = new Bridging(controller.manifest, this.bridging.bridgeS, this.bridging.critical);
   }
 
   // So many periods passed without a scan: after more than maxGap the law starts cold.
   gap(periods) {
+    this.bridging.missed(periods);
     if (periods > this.maxGap) this.state = this.controller.cold();
   }
 
-  // One period. sample: {pv, dv, mv_applied or null, age_s}, or null where the plant could not be read. Nothing that it
+  // One period. sample: {pv, dv, mv_applied or null, age_s, and fresh where not all readings are}, or null where the plant could not be read. Nothing that it
   // holds throws. -> {mode, mv, law, info, reason}; mv is null while it is not known where the MV stands: then write nothing.
+  // Where the readings of single PVs are bad and the law goes on, `bridged` and `shed` say of which, and why.
   async scan(sample) {
-    let given = null, reason = "the plant cannot be read";
+    let given = null, reason = "the plant cannot be read", readings = null;
     try {
       given = taken(sample);
-      if (given) reason = this.#refusal(given);
+      const bad = this.controller.manifest.inputs.includes("fresh") ? this.controller.manifest.pv.map(() => "") : null;
+      if (given) reason = this.#refusal(given, bad);
+      if (!reason && bad) readings = this.bridging.look(given, bad, this.operate);
     } catch (error) {
       reason = `the sample cannot be used: ${wordsOf(error)}`;
     }
+    if (reason) this.bridging.missed();
+    reason ||= readings?.reason ?? "";
     this.#found(given, reason);
     if (!given?.mv_applied) this.mv ??= this.wanted; // nobody but the operator says where it is
     this.before = this.mv;
@@ -219,7 +328,8 @@ export class Loop {
     this.mv ??= applied;
     let step;
     try {
-      step = await this.controller.step({ sp: this.sp, pv: given.pv, dv: given.dv, mv_applied: applied, state: this.state });
+      const { pv, fresh, operate } = readings ?? { pv: given.pv, operate: this.operate };
+      step = await this.controller.step({ sp: this.sp, pv, dv: given.dv, mv_applied: applied, state: this.state, operate, fresh });
     } catch (error) {
       if (this.mode === "AUTO") this.mv = applied;
       return this.#miss(wordsOf(error));
@@ -228,7 +338,8 @@ export class Loop {
     if (this.fault && ++this.good === this.recoverAfter) this.setMode("AUTO");
     if (this.mode === "AUTO") this.mv = Array.from(step.mv);
     this.#byHand();
-    return { mode: this.mode, mv: [...this.mv], law: Array.from(step.mv), info: Array.from(step.info), reason: this.fault };
+    const { bridged = {}, shed = {} } = readings ?? {};
+    return { mode: this.mode, mv: [...this.mv], law: Array.from(step.mv), info: Array.from(step.info), reason: this.fault, bridged, shed };
   }
 
   // The command in place of the last one, which never reached the plant. Others may move the MV meanwhile: nothing is
@@ -270,12 +381,18 @@ export class Loop {
     if (this.mv.every((value, i) => value === wanted[i])) this.wanted = null;
   }
 
-  #refusal({ pv, dv, mv_applied, age_s }) {
+  // Why not to act on a sample, else empty. `bad` (of a law that reads `fresh`) takes what speaks against single PVs alone.
+  #refusal({ pv, dv, mv_applied, fresh, age_s }, bad) {
     const m = this.controller.manifest;
-    const vectors = [["PV", m.pv, pv], ...(m.inputs.includes("dv") ? [["DV", m.dv, dv]] : [])];
+    if (bad && fresh && fresh.length !== m.pv.length) return `fresh has ${fresh.length} values instead of ${m.pv.length}`;
+    if (bad && pv?.length === m.pv.length)
+      m.pv.forEach((s, i) => {
+        bad[i] = notFinite("PV", [s], [pv[i]]) || (beyond(s, pv[i], PV_MARGIN) ? `PV ${outside(s, pv[i])}` : "");
+      });
+    const vectors = [...(bad && pv?.length === m.pv.length ? [] : [["PV", m.pv, pv]]), ...(m.inputs.includes("dv") ? [["DV", m.dv, dv]] : [])];
     const reason = vectors.map((vector) => notFinite(...vector)).find(Boolean) ?? (mv_applied ? this.#implausible(mv_applied) : "");
     if (reason) return reason;
-    const out = m.pv.findIndex((s, i) => beyond(s, pv[i], PV_MARGIN));
+    const out = bad ? -1 : m.pv.findIndex((s, i) => beyond(s, pv[i], PV_MARGIN));
     if (out >= 0) return `PV ${outside(m.pv[out], pv[out])}`;
     return age_s >= 0 && age_s <= m.period_s ? "" : `the sample is ${age_s} s old; allowed are ${m.period_s} s`;
   }
@@ -313,9 +430,9 @@ export function within(values, signals, what) {
 // A copy of a sample, with null for what is not there; null for no sample.
 function taken(sample) {
   if (sample === null || sample === undefined) return null;
-  const { pv = null, dv = null, mv_applied = null, age_s } = sample;
+  const { pv = null, dv = null, mv_applied = null, fresh = null, age_s } = sample;
   const copied = (values) => (values === null ? null : Array.from(values));
-  return { pv: copied(pv), dv: copied(dv), mv_applied: copied(mv_applied), age_s };
+  return { pv: copied(pv), dv: copied(dv), mv_applied: copied(mv_applied), fresh: copied(fresh), age_s };
 }
 
 function notFinite(label, signals, values) {

@@ -138,6 +138,8 @@ class Operation(nn.Module):
                 "width": 0.5 * (high - low),
                 "mv_use": mv["use"],
                 "mv_move": mv["max_move"],
+                "mv_low": mv["low"],
+                "mv_high": mv["high"],
                 "z_use": self._each_move(mv["use"]),
                 "z_low": self._each_move(first),
                 "z_high": self._each_move(last),
@@ -180,6 +182,8 @@ class Operation(nn.Module):
             rest_weight=p["rest_weight"],
             z_cost=by * p["z_cost"],
             stiffness=1 / (p["speed"] * p["speed"]),
+            mv_low=p["mv_low"],
+            mv_high=p["mv_high"],
             mv_move=p["mv_move"] * p["mv_use"],
         )
 

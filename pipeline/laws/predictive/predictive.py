@@ -317,7 +317,9 @@ class Predictive(ControlLaw):
         plan, ahead = self.planner(start, wanted, applied, plan, operated)
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)
         if operated is not None:
-            most = operated.mv_move.squeeze(-2)
+            # The plan is within them already; in engineering units it is so up to rounding.
+            low, high, most = (of.squeeze(-2) for of in (operated.mv_low, operated.mv_high, operated.mv_move))
+            mv = torch.minimum(torch.maximum(mv, low), high)
             mv = torch.minimum(torch.maximum(mv, mv_applied - most), mv_applied + most)
         info = [
             self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],

@@ -91,6 +91,8 @@ class OperatedPlan(NamedTuple):
     rest_weight: Tensor  # curvature of the cost of being away from it
     z_cost: Tensor  # slope of the cost over the moves
     stiffness: Tensor  # (..., 1, 1) of the moves' cost over the designed one
+    mv_low: Tensor  # (..., 1, n_mv) [mv]
+    mv_high: Tensor  # (..., 1, n_mv) [mv]
     mv_move: Tensor  # (..., 1, n_mv) [mv] a period; 0 of an MV out of use
 
 

@@ -47,12 +47,14 @@ class Instance:
         self._fmu = self._try("it cannot be loaded", self._made, folder)
         self._end = weakref.finalize(self, _freed, self._fmu, os.getpid())
 
-    def begin(self) -> None:
-        """Go to the start, from wherever it is."""
+    def begin(self, true: Sequence[int] = ()) -> None:
+        """Go to the start, from wherever it is, with these Boolean parameters true."""
         of, fmu = self._of, self._fmu
         if not self._fresh:
             self._try("reset", fmu.reset)
         self._fresh = False
+        if true:
+            self._try("setBoolean", fmu.setBoolean, list(true), [True] * len(true))
         if of.version == 2:
             self._try("setupExperiment", fmu.setupExperiment, None, of.begins_s)
             self._try("enterInitializationMode", fmu.enterInitializationMode)

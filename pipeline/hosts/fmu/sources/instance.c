@@ -12,8 +12,9 @@
 
 /* Value references. variables.py counts them in the same way: VR_FIRST on, group after group. */
 enum { VR_TIME, VR_FAULT, VR_USE_APPLIED, VR_FIRST };
-enum { G_SP, G_PV, G_DV, G_APPLIED, G_START, G_MV, G_INFO, GROUPS };
-static const char *const GROUP[GROUPS] = {"sp", "pv", "dv", "mv_applied", "mv_start", "mv", "info"};
+enum { G_SP, G_PV, G_DV, G_APPLIED, G_START, G_MV, G_INFO, G_OPERATE, G_FRESH, G_USE_FRESH, GROUPS };
+static const char *const GROUP[GROUPS] = {"sp", "pv", "dv", "mv_applied", "mv_start", "mv", "info", "operate", "fresh",
+                                          "use_fresh"};
 
 /* The memory of an instance is one block of doubles, so that it is saved and restored at once: these entries, the
    variables, the law's state. */
@@ -55,6 +56,8 @@ static void instance_reset(Instance *i) {
   static const int OF[G_INFO] = {SP, PV, DV, MV, MV, MV};
   for (int g = 0; g < G_INFO; g++)
     for (size_t k = 0; k < i->n[g]; k++) i->memory[i->at[g] + k] = middle(&i->c.signals[OF[g]].at[k]);
+  for (size_t k = 0; k < i->n[G_OPERATE]; k++) i->memory[i->at[G_OPERATE] + k] = i->c.operate_entries[k].standard;
+  for (size_t k = 0; k < i->n[G_FRESH]; k++) i->memory[i->at[G_FRESH] + k] = 1;
   controller_cold(&i->c);
 }
 
@@ -88,10 +91,12 @@ static bool instance_open(Instance *i, const char *token, const char *resources)
     return REFUSE(i, "the path of the FMU's resources is missing or too long");
   if (!open_in_c_locale(&i->c, path)) return REFUSE(i, "%s", i->c.words);
   if (!is_token_of(&i->c, token)) return REFUSE(i, "the FMU's token %s is not of its controller", token ? token : "");
-  static const int OF[G_START] = {SP, PV, DV, MV};
+  static const int OF[GROUPS] = {SP, PV, DV, MV, [G_OPERATE] = OPERATE, [G_FRESH] = FRESH, [G_USE_FRESH] = FRESH};
   size_t end = OWN;
   for (int g = 0; g < GROUPS; g++) {
-    i->n[g] = g < G_START ? (i->c.uses[OF[g]] ? i->c.n_in[OF[g]] : 0) : g == G_INFO ? i->c.n_out[OUT_INFO] : i->c.n_in[MV];
+    if (g == G_START || g == G_MV) i->n[g] = i->c.n_in[MV];
+    else if (g == G_INFO) i->n[g] = i->c.n_out[OUT_INFO];
+    else i->n[g] = !i->c.uses[OF[g]] ? 0 : g == G_USE_FRESH ? 1 : i->c.n_in[OF[g]];
     i->at[g] = end;
     end += i->n[g];
   }
@@ -134,6 +139,7 @@ static bool instance_begun(Instance *i) {
       return REFUSE(i, "mv_start.%s = %g %s is not allowed: its range is %g to %g%s", s->name, value, s->unit, s->low,
                     s->high, s->values ? ", and it has set values only" : "");
   }
+  if (!operate_allowed(&i->c, i->memory + i->at[G_OPERATE], i->n[G_OPERATE])) return REFUSE(i, "%s", i->c.words);
   i->memory[PHASE] = STEPPING;
   return true;
 }
@@ -152,7 +158,8 @@ static int group_of(const Instance *i, unsigned reference, size_t *entry) {
 static bool get_real(Instance *i, unsigned reference, double *value) {
   size_t entry;
   if (reference == VR_TIME) return *value = i->memory[NOW], true;
-  if (group_of(i, reference, &entry) < 0) return REFUSE(i, "there is no real variable %u", reference);
+  int g = group_of(i, reference, &entry);
+  if (g < 0 || g == G_USE_FRESH) return REFUSE(i, "there is no real variable %u", reference);
   *value = i->memory[entry];
   return true;
 }
@@ -160,10 +167,12 @@ static bool get_real(Instance *i, unsigned reference, double *value) {
 static bool set_real(Instance *i, unsigned reference, double value) {
   size_t entry;
   int g = group_of(i, reference, &entry), phase = (int)i->memory[PHASE];
-  if (g < 0) return REFUSE(i, "there is no real variable %u that could be set", reference);
-  if (g >= G_MV || phase == TERMINATED || (g == G_START && phase == STEPPING))
+  if (g < 0 || g == G_USE_FRESH) return REFUSE(i, "there is no real variable %u that could be set", reference);
+  bool output = g == G_MV || g == G_INFO;
+  if (output || phase == TERMINATED || (g == G_START && phase == STEPPING))
     return REFUSE(i, "variable %u, of %s, cannot be set %s", reference, GROUP[g],
-                  g >= G_MV ? "because it is an output" : phase == STEPPING ? "after the initialization" : "after the end");
+                  output ? "because it is an output" : phase == STEPPING ? "after the initialization" : "after the end");
+  if (g == G_OPERATE && !operate_within(&i->c, entry - i->at[g], value)) return REFUSE(i, "%s", i->c.words);
   i->memory[entry] = value;
   /* A tool may write the start values of inputs that nothing is connected to, but it does so before the first step. */
   if (g == G_APPLIED && phase == STEPPING) i->memory[APPLIED_IS_SET] = 1;
@@ -171,18 +180,28 @@ static bool set_real(Instance *i, unsigned reference, double value) {
   return true;
 }
 
+/* Where a Boolean variable is remembered; 0 where there is none of this value reference. */
+static size_t flag_of(const Instance *i, unsigned reference) {
+  size_t entry;
+  if (reference == VR_FAULT) return FAULT;
+  if (reference == VR_USE_APPLIED && i->n[G_APPLIED]) return USE_APPLIED;
+  return group_of(i, reference, &entry) == G_USE_FRESH ? entry : 0;
+}
+
 static bool get_boolean(Instance *i, unsigned reference, bool *value) {
-  if (reference != VR_FAULT && !(reference == VR_USE_APPLIED && i->n[G_APPLIED]))
-    return REFUSE(i, "there is no Boolean variable %u", reference);
-  *value = i->memory[reference == VR_FAULT ? FAULT : USE_APPLIED] != 0;
+  size_t entry = flag_of(i, reference);
+  if (!entry) return REFUSE(i, "there is no Boolean variable %u", reference);
+  *value = i->memory[entry] != 0;
   return true;
 }
 
 static bool set_boolean(Instance *i, unsigned reference, bool value) {
-  if (reference != VR_USE_APPLIED || !i->n[G_APPLIED]) return REFUSE(i, "variable %u cannot be set as a Boolean", reference);
+  size_t entry = flag_of(i, reference);
+  if (!entry || entry == FAULT) return REFUSE(i, "variable %u cannot be set as a Boolean", reference);
   if (i->memory[PHASE] == STEPPING || i->memory[PHASE] == TERMINATED) /* it is a fixed parameter, as mv_start is */
-    return REFUSE(i, "use_mv_applied cannot be set after the %s", i->memory[PHASE] == STEPPING ? "initialization" : "end");
-  i->memory[USE_APPLIED] = value;
+    return REFUSE(i, "%s cannot be set after the %s", entry == USE_APPLIED ? "use_mv_applied" : "use_fresh",
+                  i->memory[PHASE] == STEPPING ? "initialization" : "end");
+  i->memory[entry] = value;
   return true;
 }
 
@@ -192,6 +211,8 @@ static void sample(Instance *i, double at_s) {
   bool connected = i->n[G_APPLIED] && m[USE_APPLIED] != 0 && m[APPLIED_IS_SET] != 0;
   const double *const given[STATE] = {m + i->at[G_SP], m + i->at[G_PV], m + i->at[G_DV],
                                       m + i->at[connected ? G_APPLIED : G_MV]};
+  bool told = i->n[G_FRESH] && m[i->at[G_USE_FRESH]] != 0;
+  for (size_t k = 0; k < i->n[G_FRESH]; k++) i->c.fresh[k] = told ? m[i->at[G_FRESH] + k] : 1;
   m[FAULT] = controller_step(&i->c, given) != STEPPED;
   if (m[FAULT] != 0) {
     speak(i, LOG_WARNING, "the sample at %.15g s is refused and the MV held: %s", at_s, i->c.words);
@@ -210,6 +231,8 @@ static bool instance_step(Instance *i, double from, double length) {
     return REFUSE(i, "a communication step of %g s from %g s on is not allowed", length, from);
   if (!(fabs(from - m[NOW]) <= slack))
     return REFUSE(i, "the step begins at %.15g s, but the last one ended at %.15g s", from, m[NOW]);
+  /* The ends of a range are set one by one, so that they are compared here. */
+  if (i->n[G_OPERATE] && !controller_operate(&i->c, m + i->at[G_OPERATE])) return REFUSE(i, "%s", i->c.words);
   for (double at; (at = m[BEGINS] + m[SAMPLES] * period) < end - slack; m[SAMPLES]++) sample(i, at);
   m[NOW] = end;
   return true;
@@ -273,7 +296,12 @@ static bool plausible(Instance *i, const double *m) {
   /* Before the end of the initialization mv_start is as the tool set it, and checked then. */
   if (phase == STEPPING ? !allowed_mv(i, start) || !allowed_mv(i, mv) : !untouched && !(begun && allowed_mv(i, mv)))
     return REFUSE(i, "the saved state has an MV that is not allowed");
-  if (!finite_all(m + i->at[G_INFO], i->n_memory - i->at[G_INFO])) /* info, and the law's state behind it */
+  for (size_t k = 0; k < i->n[G_OPERATE]; k++)
+    if (!operate_within(&i->c, k, m[i->at[G_OPERATE] + k])) return REFUSE(i, "the saved state has %s", i->c.words);
+  if (i->n[G_USE_FRESH] && m[i->at[G_USE_FRESH]] != 0 && m[i->at[G_USE_FRESH]] != 1)
+    return REFUSE(i, "the saved state has a flag of %g", m[i->at[G_USE_FRESH]]);
+  size_t n_state = i->c.n_in[STATE];
+  if (!finite_all(m + i->at[G_INFO], i->n[G_INFO]) || !finite_all(m + i->n_memory - n_state, n_state))
     return REFUSE(i, "the saved state has info or a state of the law that is not finite");
   return true;
 }
