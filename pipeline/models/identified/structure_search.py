@@ -116,7 +116,9 @@ def select(
     if rounds.problem.fed_back:
         return by_innovations(rounds, orders, units)
     found = by_free_runs(rounds, orders, units, lagged=lagged)
-    return _beside_loads(rounds, found, orders, units) if _misses(rounds.problem, found.chosen, DRIFTS) else found
+    # A choice that takes a part of its error back leaves little of any load: its plain free runs tell.
+    missed = _misses(rounds.problem, found.chosen, DRIFTS, plain=True)
+    return _beside_loads(rounds, found, orders, units) if missed else found
 
 
 def by_free_runs(
@@ -286,10 +288,12 @@ def _curved(problem: Problem, trial: CandidateFits) -> bool:
     return curved(best.model, best.starts, problem.train(trial.structure, fold), trial.structure.correction)
 
 
-def _misses(problem: Problem, trial: CandidateFits, ratio: float) -> bool:
+def _misses(problem: Problem, trial: CandidateFits, ratio: float, *, plain: bool = False) -> bool:
+    """Whether a trial misses more than ``ratio`` times the noise in its own runs, or in ``plain`` free runs."""
     fold = trial.folds[0]
     best = trial.of_fold(fold)[0]
-    return misses(best.model, best.starts, problem.train(trial.structure, fold), ratio, trial.structure.correction)
+    correction = 0.0 if plain else trial.structure.correction
+    return misses(best.model, best.starts, problem.train(trial.structure, fold), ratio, correction)
 
 
 # ------------------------------------------------------------ the search as work that the members of an ensemble share

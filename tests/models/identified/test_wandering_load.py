@@ -69,6 +69,14 @@ def test_a_correction_that_is_given_keeps_free_runs() -> None:
     assert part.learn(Source(with_load(1.5), SOURCE_SIGNALS)).metrics["structure"]["rows_ahead"] is None
 
 
+def test_a_choice_that_takes_its_error_back_hides_no_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a correction the residual is small, whatever wanders: what counts is what plain free runs miss."""
+    source = Source(with_load(1.5), SOURCE_SIGNALS)
+    corrected = replace(PART, correction=0.5).groundwork().done(source, "search").selection
+    monkeypatch.setattr(structure_search, "by_free_runs", lambda *_given, **_more: corrected)
+    assert PART.groundwork().done(source, "search").selection.ahead is not None
+
+
 def test_of_both_models_the_one_that_foresees_better_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     taken = {}
     for better in (True, False):
