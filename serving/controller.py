@@ -137,7 +137,8 @@ class Controller:
             What operators have changed, shape (n_operate,), as the manifest's ``operate`` lists it; None: its defaults.
         fresh
             1 for each process variable whose reading is new and good, 0 for one that is neither, shape (n_pv,); None:
-            all are. The number in ``pv`` must be finite all the same, and is not used.
+            all are. The number in ``pv`` must be finite all the same. It is not used, but for a first step without a
+            past, which has nothing else to begin from: give the last good one.
 
         Raises
         ------

@@ -225,6 +225,10 @@ class Manifest:
         names = [entry.name for entry in self.operate]
         if len(set(names)) < len(names):
             raise ArtifactError(f"the manifest's operate has a name twice: {', '.join(names)}")
+        for one, other in (("low", "high"), ("high", "low")):
+            alone = [e.name for e in self.operate if e.what == one and f"{e.signal}.{other}" not in names]
+            if alone:
+                raise ArtifactError(f"the manifest's operate has {alone[0]}, but no {other} end of that signal")
         limited = [s.name for s in self.mv if s.most < math.inf]
         if limited and "mv_applied" not in self.inputs:
             raise ArtifactError(

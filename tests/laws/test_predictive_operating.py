@@ -126,6 +126,9 @@ def test_a_further_variable_of_the_plant_has_a_range_alone() -> None:
     assert y[-1, 1] <= 0.1
     with pytest.raises(ContractError, match=r"y1\.track"):
         operate.with_values({"y1.track": 1})  # it has no set point
+    ramp = Predictive(signals, SQUARE, Predictive.Params(operate={}, preview="ramp")).eval()
+    y, _ = operated(ramp, SQUARE, 200, np.array([0.8]), lambda _k: Operate(ramp.operate).default)
+    np.testing.assert_allclose(y[-1, 0], 0.8, atol=1e-3)
 
 
 @pytest.mark.parametrize(("first", "second"), [("y0", "y1"), ("y1", "y0")])
@@ -168,6 +171,27 @@ def test_an_mv_out_of_use_stays_and_the_others_do_its_work(wide: tuple[Predictiv
     y, mv = operated(law, WIDE, 200, np.array([0.8, 0.5]), lambda k: operate.default if k < 50 else out)
     assert (mv[50:, 1] == mv[49, 1]).all()
     np.testing.assert_allclose(y[-1], [0.8, 0.5], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "out", [{"u1.use": 0}, {"y0.use": 0, "y1.use": 0}, {"y0.track": 0, "y1.track": 0}, {"y0.use": 0}]
+)
+@pytest.mark.parametrize("offset", [0.005, -0.03])
+def test_an_actuator_that_reads_back_a_little_off_stands_where_nothing_pulls(
+    out: dict[str, float], offset: float, wide: tuple[Predictive, Operate]
+) -> None:
+    """What is read back is not commanded, read off again, and so on to the end of the range."""
+    law, operate = wide
+    x, state, mv = (torch.zeros(k).double() for k in (WIDE.n_x, law.n_state, 3))
+    sp, mvs = torch.tensor([0.4, 0.3]).double(), []
+    with torch.no_grad():
+        for k in range(250):
+            now = operate.with_values(out) if k > 60 else operate.default
+            mv, state, _ = law(sp, WIDE.measured(x), NONE, mv + offset, state, torch.from_numpy(now))
+            mvs.append(mv.numpy())
+            x = WIDE(torch.cat([x, mv + offset]))
+    assert np.abs(mvs[249][1] - mvs[60][1]) < 0.02  # where it stood when it was taken out
+    assert np.abs(mvs[249] - mvs[150]).max() < 1e-3
 
 
 def test_where_nothing_else_decides_an_mv_goes_to_its_resting_value(wide: tuple[Predictive, Operate]) -> None:
@@ -271,6 +295,14 @@ def test_a_manifest_of_a_law_without_it_has_no_such_entry(tmp_path: Path) -> Non
     assert "operate" not in manifest.to_json()
     with pytest.raises(ArtifactError, match="operate"):
         replace(manifest, inputs=(*manifest.inputs, "operate"))
+
+
+def test_a_pv_and_an_mv_of_one_name_are_refused_at_the_design() -> None:
+    signals = made_signals(1, 1)
+    twins = replace(signals, mv=(replace(signals.mv[0], name="y0"),))
+    with pytest.raises(LawError, match="y0"):
+        Predictive(twins, random_model(1), Predictive.Params(horizon=20, operate={}))
+    Predictive(twins, random_model(1), Predictive.Params(horizon=20))  # without, they never meet
 
 
 @pytest.mark.parametrize("defaults", [{"y9.low": 0.0}, {"y0.low": 5.0}, {"y0.low": 1.0, "y0.high": 0.0}])

@@ -46,6 +46,11 @@ def entries_of(
     ``defaults`` by name, in engineering units. LawError for an unknown name or a default that operators may not set.
     """
     found = []
+    both = {s.name for s in signals.pv[:outputs]} & {s.name for s in signals.mv}
+    if both:
+        raise LawError(
+            f"law 'predictive': {', '.join(sorted(both))} names a PV and an MV; with `operate` give each its own name"
+        )
 
     def add(
         group: Group, s: Signal | None, what: What, default: float, low: float, high: float, unit: str = ""
@@ -154,10 +159,10 @@ class Operation(nn.Module):
 
         self.numbers = AffineMap({"operate": len(entries)}, formulas)
 
-    def forward(self, operate: Tensor, stands: Tensor, sd: Tensor) -> OperatedPlan:
-        """``operate`` (..., 1, n) as the manifest lists it; ``stands`` (..., 1, m), scaled: the applied MVs.
+    def forward(self, operate: Tensor, stands: Tensor, off: Tensor, sd: Tensor) -> OperatedPlan:
+        """The numbers of ``operate`` (..., 1, n), which is as the manifest lists it.
 
-        ``sd`` (..., 1, n_o), scaled, of the estimated outputs: a variable that follows no set point is kept
+        ``stands`` (..., 1, m), scaled: where the MVs go on from, and ``off`` by how much they stand off that. ``sd`` (..., 1, n_o), scaled, of the estimated outputs: a variable that follows no set point is kept
         ``MARGIN_SDS`` of them inside its range, or noise would have it outside half of the time.
         """
         p = self.numbers(operate)
@@ -174,6 +179,7 @@ class Operation(nn.Module):
             price=torch.exp(p["rank"]) * p["use"],
             y_cost=by * p["y_cost"] * p["use"],
             stands=stands,
+            off=off,
             z_low=p["z_low"],
             z_high=p["z_high"],
             rate=p["rate"] * p["z_use"],

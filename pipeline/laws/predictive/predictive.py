@@ -36,6 +36,8 @@ from loopwright.pipeline.tuning.calm_choice import calmest
 # Of the searched numbers, for a plant on which they do not hold:
 CALM_SPEED = 0.3  # moves weigh eleven times as much
 CALM_JUMPS = 0.1  # the observer takes a swing of its own loop for steps of a load less
+UNBOUNDED = 1e6  # scaled: no set point comes near
+SAME_PLACE = 0.02  # share of an MV's range by which scaling may carry a sound read-back off its command
 
 
 class Predictive(ControlLaw):
@@ -70,6 +72,7 @@ class Predictive(ControlLaw):
     remarks: tuple[str, ...] = ()  # on a horizon that is short for the model
     operation: Operation | None  # of a law that reads ``operate`` and ``fresh``
     operate_default: Tensor  # (n_operate,)
+    same: Tensor  # (n_mv,) [mv] by which a read-back may be off the command
     variances: Tensor  # (n_o,) where the outputs' variances stand in the state's covariance
     shift: Tensor  # (m, m) of a plan to the next sample
     upper: Tensor  # where the flat covariance's upper half stands
@@ -141,7 +144,8 @@ class Predictive(ControlLaw):
             low, high = ((end - model.y_center[:n_cv]) / model.y_scale[:n_cv] for end in ends.T)
             if bounds is not None:
                 low, high = (torch.minimum(torch.maximum(end, bounds[0]), bounds[1]) for end in (low, high))
-            bounds = low, high
+            others = torch.full((n_o - n_cv,), UNBOUNDED, dtype=torch.float64)  # outputs without a set point
+            bounds = torch.cat([low, -others]), torch.cat([high, others])
         return SetPointCourse(self.moves.horizon, n_o, bounds, ramp=ramp)
 
     def _build_operation(
@@ -153,6 +157,7 @@ class Predictive(ControlLaw):
         self.operate = entries_of(self.signals, n_o, low, high, params.operate or {})
         scales = OperateScales(model.y_center[:n_o], model.y_scale[:n_o], middle, half)
         self.operation = Operation(self.operate, scales, self.moves, most_weight)
+        self.register_buffer("same", 2 * SAME_PLACE * half)
         default = torch.tensor([entry.default for entry in self.operate], dtype=torch.float64)
         self.register_buffer("operate_default", default)
         rows, columns = torch.triu_indices(self.observer.n_a, self.observer.n_a)
@@ -175,6 +180,7 @@ class Predictive(ControlLaw):
             "level": levels,
             "sp": n_cv if self.wanted.ramp else 0,
             "sp_before": n_cv if self.wanted.ramp else 0,
+            "given": 0 if self.operation is None else len(half),
         }
         self.kept = kept | {name: n for name, n in older.items() if n}
         self.n_state = sum(self.kept.values())
@@ -297,15 +303,18 @@ class Predictive(ControlLaw):
         parts = torch.split(state.unsqueeze(-2), list(self.kept.values()), dim=-1)
         kept = dict(zip(self.kept, parts, strict=True))
         operated, seen, n_y = None, None, now["y"].shape[-1]
-        applied = torch.clamp(now["z"], -1.0, 1.0)
+        applied, stands = torch.clamp(now["z"], -1.0, 1.0), mv_applied
         if self.operation is not None:
+            stands = self._stands(mv_applied, kept)
+            applied = torch.clamp((stands - self.mv_middle) / self.mv_half, -1.0, 1.0).unsqueeze(-2)
             given = self.operate_default.expand(*sp.shape[:-1], -1) if operate is None else operate
             seen = torch.ones_like(now["y"]) if fresh is None else fresh[..., :n_y].unsqueeze(-2)
             share = self.operation.load_share(given.unsqueeze(-2))
             mean, boost, estimate, plan = self._estimated(now, kept, seen, share)
             variance = estimate[..., mean.shape[-1] :].index_select(-1, self.variances)
-            stands = applied.repeat(*(1 for _ in applied.shape[:-1]), len(self.moves.starts))
-            operated = self.operation(given.unsqueeze(-2), stands, torch.sqrt(torch.clamp(variance, min=0.0)))
+            sd, off = torch.sqrt(torch.clamp(variance, min=0.0)), torch.clamp(now["z"], -1.0, 1.0) - applied
+            moves = [of.repeat(*(1 for _ in of.shape[:-1]), len(self.moves.starts)) for of in (applied, off)]
+            operated = self.operation(given.unsqueeze(-2), *moves, sd)
         else:
             mean, boost, estimate, plan = self._estimated(now, kept)
         measured = now["v"][..., now["z"].shape[-1] :]
@@ -320,15 +329,27 @@ class Predictive(ControlLaw):
             # The plan is within them already; in engineering units it is so up to rounding.
             low, high, most = (of.squeeze(-2) for of in (operated.mv_low, operated.mv_high, operated.mv_move))
             mv = torch.minimum(torch.maximum(mv, low), high)
-            mv = torch.minimum(torch.maximum(mv, mv_applied - most), mv_applied + most)
+            mv = torch.minimum(torch.maximum(mv, stands - most), stands + most)
+        mv = self.limited(mv, mv_applied)
         info = [
             self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],
             self.y_center + self.y_scale * ahead[..., :n_cv],
             boost[..., :n_cv],
         ]
         recipe = [now["sp"], past[0]] if past else []
-        state_next = torch.cat([now["one"], estimate, plan, measured, *levels, *recipe], dim=-1).squeeze(-2)
-        return self.limited(mv, mv_applied), state_next, torch.cat(info, dim=-1).squeeze(-2)
+        ordered = [mv.unsqueeze(-2)] if "given" in kept else []
+        state_next = torch.cat([now["one"], estimate, plan, measured, *levels, *recipe, *ordered], dim=-1).squeeze(-2)
+        return mv, state_next, torch.cat(info, dim=-1).squeeze(-2)
+
+    def _stands(self, mv_applied: Tensor, kept: Named) -> Tensor:
+        """Where each MV goes on from (..., n_mv) [mv]: its last command, or the applied value where that is elsewhere.
+
+        A read-back that is a little off would else be commanded, read off again, and so walk to the end of the range
+        wherever nothing pulls: of an MV out of use, or of moves that no output shows.
+        """
+        given = kept["given"].squeeze(-2)
+        near = (mv_applied - given).abs() <= self.same
+        return torch.where(near & (kept["started"].squeeze(-2) > 0), given, mv_applied)
 
     def _of_outputs(self, sp: Tensor) -> Tensor:
         """Set points (..., 1, n_o), zeros for outputs that have a range alone."""

@@ -82,7 +82,8 @@ class OperatedPlan(NamedTuple):
     high_inside: Tensor
     price: Tensor  # of what lies beyond a range; 0 out of use
     y_cost: Tensor  # slope of the cost over the outputs
-    stands: Tensor  # the applied MV at every move
+    stands: Tensor  # where the MV goes on from, at every move
+    off: Tensor  # by how much the actuator stands off its command, at every move: it stays so
     z_low: Tensor  # of the moves
     z_high: Tensor
     rate: Tensor  # largest difference from the move before; 0 out of use
@@ -269,7 +270,7 @@ class Planner(nn.Module):
         )
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         for _ in range(self.passes):
-            run = self.horizon(start, plan)
+            run = self.horizon(start, plan + by.off)
             error = run.y - wanted
             weight = weights / torch.sqrt(error * error + self.eps_squared)
             push = limit_cost(run.y, by.low_inside, by.high_inside, by.price, self.soft, self.soft_squared)
