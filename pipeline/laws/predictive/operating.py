@@ -162,8 +162,9 @@ class Operation(nn.Module):
     def forward(self, operate: Tensor, stands: Tensor, off: Tensor, sd: Tensor) -> OperatedPlan:
         """The numbers of ``operate`` (..., 1, n), which is as the manifest lists it.
 
-        ``stands`` (..., 1, m), scaled: where the MVs go on from, and ``off`` by how much they stand off that. ``sd`` (..., 1, n_o), scaled, of the estimated outputs: a variable that follows no set point is kept
-        ``MARGIN_SDS`` of them inside its range, or noise would have it outside half of the time.
+        ``stands`` (..., 1, m), scaled: where the MVs go on from, and ``off`` by how much they stand off that. ``sd``
+        (..., 1, n_o), scaled, of the estimated outputs: a variable that follows no set point is kept ``MARGIN_SDS`` of
+        them inside its range, or noise would have it outside half of the time.
         """
         p = self.numbers(operate)
         # Only ratios of costs count: the largest, per scaled unit, becomes the slope.

@@ -24,6 +24,12 @@ FILTER_ITERATIONS = 20
 """Iterations in which the filter's gain of a model of free runs is fitted."""
 
 
+ALIKE_AHEAD = 1.1
+"""Ratio of errors ahead up to which both models are alike. They are only compared where free runs miss more than noise,
+so that the model of free runs is bent to what no input did. On the benchmark's plant whose gain fades the ratio was 1.03;
+the other records that were measured have .94 or less."""
+
+
 class ErrorsAhead(NamedTuple):
     """Scaled errors ``PREDICTED_AHEAD`` rows ahead, of the model that one-step errors chose, and of free runs' choice.
 
@@ -35,8 +41,8 @@ class ErrorsAhead(NamedTuple):
 
     @property
     def wanders(self) -> bool:
-        """Whether the model with loads foresees the rows better; False where nothing can be compared."""
-        return self.one_step < self.free_runs < np.inf
+        """Whether the model with loads foresees the rows as well; False where nothing can be compared."""
+        return self.one_step < ALIKE_AHEAD * self.free_runs < np.inf
 
 
 def errors_ahead(rounds: Rounds, one_step: CandidateFits, free_runs: CandidateFits) -> ErrorsAhead:
