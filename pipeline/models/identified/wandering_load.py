@@ -26,8 +26,8 @@ FILTER_ITERATIONS = 20
 
 ALIKE_AHEAD = 1.1
 """Ratio of errors ahead up to which both models are alike. They are only compared where free runs miss more than noise,
-so that the model of free runs is bent to what no input did. On the benchmark's plant whose gain fades the ratio was 1.03;
-the other records that were measured have .94 or less."""
+so that the model of free runs is bent to what no input did. It was 1.03 on the benchmark's plant whose gain fades; the
+other records that were measured have .94 or less."""
 
 
 class ErrorsAhead(NamedTuple):
