@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Self, TypeAlias
 
@@ -121,8 +121,9 @@ class Bridging:
         if reason:
             return reason if isinstance(reason, str) else str(reason), sample
         if self._apart:
-            why, sample = refused_apart(guards, sample, past, self.manifest.pv)
-            return why or "", sample
+            shown = replace(sample, last_pv=self._last.copy(), since=self._gone + 1.0)
+            why, judged = refused_apart(guards, shown, past, self.manifest.pv)
+            return why or "", sample if judged.bad_pv is sample.bad_pv else replace(sample, bad_pv=judged.bad_pv)
         return refused(guards, sample, past) or "", sample
 
     def _bridged(self, sample: Sample, operate: Array) -> Readings:

@@ -195,7 +195,76 @@ def test_guards_that_look_back_speak_of_one_pv_alone(operated: Controller) -> No
         assert list(loop.scan(sample(p=4.0 + next(at), x=next(at))).bridged) == ["T"]  # frozen
     assert not loop.scan(sample(t=301.0, p=4.0 + next(at), x=next(at))).bridged
     assert list(loop.scan(sample(t=320.0, p=4.0 + next(at), x=next(at))).bridged) == ["T"]  # too fast
-    assert not loop.scan(sample(t=321.0, p=4.0 + next(at), x=next(at))).bridged  # as after any fault: it stands there
+    assert list(loop.scan(sample(t=322.0, p=4.0 + next(at), x=next(at))).bridged) == ["T"]  # 21 K in two periods
+    assert not loop.scan(sample(t=321.0, p=4.0 + next(at), x=next(at))).bridged  # 20 K in three
+
+
+def rated(operated: Controller, **options: Any) -> ControlLoop:
+    """A loop in which T may move by 5 K a period."""
+    guards = (*default_guards(operated.manifest), Rate(operated.manifest.pv, (5.0, 5.0, 5.0)))
+    return loop_of(operated, guards=guards, bridge_s=100.0, recover_after=1, **options)
+
+
+def test_a_pv_that_jumped_and_stays_is_good_again_once_it_can_have_got_there(operated: Controller) -> None:
+    loop = rated(operated)
+    loop.scan(sample())
+    moved = [loop.scan(sample(t=352.0)) for _ in range(12)]
+    assert [bool(c.bridged) for c in moved] == [True] * 10 + [False] * 2  # 52 K, of 5 K for each of 11 periods
+    assert {law_sees(loop, c).pv["T"] for c in moved[:10]} == {300.0}
+    assert law_sees(loop, moved[10]).fresh["T"] == 1.0
+
+
+def test_a_jump_is_not_forgotten_over_a_fault_of_the_whole_sample(operated: Controller) -> None:
+    loop = rated(operated)
+    loop.scan(sample())
+    assert loop.scan(sample(t=380.0)).bridged
+    assert loop.scan(sample(t=380.0, valve=NAN)).mode is Mode.HOLD
+    loop.miss("the plant cannot be read")
+    assert list(loop.scan(sample(t=380.0)).bridged) == ["T"]
+    assert not loop.scan(sample(t=310.0)).bridged
+
+
+def test_a_jump_that_was_read_as_bad_first_is_one_all_the_same(operated: Controller) -> None:
+    loop = rated(operated)
+    loop.scan(sample())
+    assert loop.scan(sample(t=NAN)).bridged
+    assert list(loop.scan(sample(t=380.0)).bridged) == ["T"]
+    assert not loop.scan(sample(t=314.0)).bridged
+
+
+class OneAfterTheOther:
+    """A guard of somebody's own: it names the first PV that is too high, and knows of no ``bad_pv``."""
+
+    memory = 0
+
+    def check(self, sample: Sample, past: Any) -> str | None:
+        for name, value, most in zip(("T", "p", "x"), sample.pv, (350.0, 6.0, 1.0), strict=True):
+            if not value <= most:
+                return Fault(f"PV {name} is too high", "own", f"PV {name}")
+        return None
+
+
+@pytest.mark.parametrize("first", [{"t": 360.0}, {"t": NAN}, {"t": 360.0, "bad_pv": ("bad", "", "")}], ids=str)
+def test_a_guard_of_ones_own_hides_no_second_bad_pv(operated: Controller, first: dict[str, Any]) -> None:
+    loop = loop_of(operated, guards=lambda m: (*default_guards(m), OneAfterTheOther()))
+    loop.scan(sample())
+    for _ in range(2):
+        command = loop.scan(sample(p=9.0, x=3.0, **first))
+        assert sorted(command.bridged) == ["T", "p", "x"]
+        assert law_sees(loop, command).pv == {"T": 300.0, "p": 5.0, "x": 0.5}
+    assert list(loop.scan(sample(**first)).bridged) == ["T"]
+
+
+def test_a_guard_of_ones_own_that_no_good_number_contents_refuses_the_sample(operated: Controller) -> None:
+    class Never:
+        memory = 0
+
+        def check(self, sample: Sample, past: Any) -> str | None:
+            return Fault("T is odd", "odd", "PV T") if sample.pv[1] > 5 else None
+
+    loop = loop_of(operated, guards=[Never()])
+    loop.scan(sample())
+    assert held(loop.scan(sample(p=6.0)), "PV T")
 
 
 def test_a_guard_of_ones_own_that_looks_at_every_pv_ends(operated: Controller) -> None:
