@@ -121,8 +121,8 @@ class Bridging:
         if reason:
             return reason if isinstance(reason, str) else str(reason), sample
         if self._apart:
-            shown = replace(sample, last_pv=self._last.copy(), since=self._gone + 1.0)
-            why, judged = refused_apart(guards, shown, past, self.manifest.pv)
+            seen = replace(sample, last_pv=self._last.copy(), since=self._gone + 1.0)
+            why, judged = refused_apart(guards, seen, past, self.manifest.pv)
             return why or "", sample if judged.bad_pv is sample.bad_pv else replace(sample, bad_pv=judged.bad_pv)
         return refused(guards, sample, past) or "", sample
 
