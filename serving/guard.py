@@ -92,6 +92,10 @@ class Sample:
     endpoint has none. ``bad_pv`` says for each PV why its reading alone is not trusted, empty where it is; an empty
     tuple: all are. A law that reads ``fresh`` goes on without these, see ``loopwright.serving.bridging``.
 
+    ``fresh`` is for such a law, too: 0 says that the number of a PV is no new reading, as of an analyser between two
+    results. It is neither judged nor used, the law predicts the PV for as long as it takes, and nothing is wrong.
+    Any other law takes the number that stands there.
+
     ``last_pv`` and ``since`` are for guards, and none of the endpoint's: the loop of such a law shows by them the last
     good number of each PV, NaN where there is none, and how many periods ago it was read.
     """
@@ -104,12 +108,17 @@ class Sample:
     quality: tuple[int, ...] = ()
     late: str = ""
     bad_pv: tuple[str, ...] = ()  # shape: (n_pv,), or empty
+    fresh: Array | None = None  # shape: (n_pv,), 1 or 0; None: all are
     last_pv: Array | None = None  # shape: (n_pv,)
     since: Array | None = None  # shape: (n_pv,), in periods, 1 or more
 
     def is_bad(self, i: int) -> bool:
-        """Whether the reading of PV ``i`` is known to be bad: no guard judges it again."""
-        return bool(self.bad_pv) and bool(self.bad_pv[i])
+        """Whether the reading of PV ``i`` is known to be bad, or none: no guard judges it again."""
+        return bool(self.bad_pv and self.bad_pv[i]) or self.is_stale(i)
+
+    def is_stale(self, i: int) -> bool:
+        """Whether the number of PV ``i`` is no new reading, by the host's own word."""
+        return self.fresh is not None and not self.fresh[i]
 
 
 class Guard(Protocol):
@@ -217,7 +226,7 @@ class Frozen:
         if len(recent) < self.memory:
             return None
         for i, s in enumerate(self.signals):
-            if all(old.pv[i] == sample.pv[i] for old in recent) and not sample.is_bad(i):
+            if all(old.pv[i] == sample.pv[i] and not old.is_stale(i) for old in recent) and not sample.is_bad(i):
                 words = f"PV {s.name} is frozen at {sample.pv[i]:.6g} {s.unit} for {self.samples} samples"
                 return Fault(words, "frozen", f"PV {s.name}")
         return None
@@ -319,7 +328,7 @@ def refused_apart(
             elif sample.last_pv is None or shown.pv[place] == sample.last_pv[place] or np.isnan(sample.last_pv[place]):
                 return reason, sample
             else:
-                known = np.array([bool(why) for why in sample.bad_pv])
+                known = [sample.is_bad(i) for i in range(len(signals))]
                 shown = replace(shown, pv=np.where(known, sample.last_pv, sample.pv))
     return None, sample
 

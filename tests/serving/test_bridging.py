@@ -290,6 +290,66 @@ def test_settings_that_cannot_be_are_refused(operated: Controller, options: dict
         loop_of(operated, **options)
 
 
+# ------------------------------------------------------------------------------------------------------- no new reading
+def stale(*names: str, **changed: Any) -> Sample:
+    return sample(**changed, fresh=np.array([float(n not in names) for n in ("T", "p", "x")]))
+
+
+@pytest.mark.parametrize("number", [300.0, 333.0, 999.0, NAN])
+def test_a_pv_without_a_new_reading_is_predicted_for_as_long_as_it_takes(operated: Controller, number: float) -> None:
+    guards = (*default_guards(operated.manifest), Rate(operated.manifest.pv, (1.0, 1.0, 1.0)))
+    loop = loop_of(operated, guards=guards, critical=["T", "x"])
+    loop.scan(sample(t=301.0))
+    for _ in range(5 * BRIDGE):
+        command = loop.scan(stale("T", "x", t=number))
+        assert (command.mode, command.fault, dict(command.bridged), dict(command.shed)) == (Mode.AUTO, "", {}, {})
+        seen = law_sees(loop, command)
+        assert (seen.fresh, seen.pv["T"]) == ({"T": 0.0, "p": 1.0, "x": 0.0}, 301.0)
+        assert seen.operate["T.use"] == 1.0
+    command = loop.scan(sample(t=310.0))
+    assert (law_sees(loop, command).fresh["T"], law_sees(loop, command).pv["T"]) == (1.0, 310.0)
+
+
+def test_a_bad_reading_after_old_ones_has_its_whole_bridge_and_stays_bad(operated: Controller) -> None:
+    loop = loop_of(operated)
+    loop.scan(sample())
+    for _ in range(20):
+        loop.scan(stale("T"))
+    assert list(loop.scan(sample(t=NAN)).bridged) == ["T"]
+    found = [loop.scan(stale("T")) for _ in range(BRIDGE + 1)]
+    assert [list(c.bridged) for c in found] == [["T"], ["T"], [], []]
+    assert [list(c.shed) for c in found] == [[], [], ["T"], ["T"]]
+    assert not loop.scan(sample()).shed
+    assert not loop.scan(stale("T")).bridged
+
+
+def test_a_pv_that_was_never_read_is_not_predicted(operated: Controller) -> None:
+    loop = loop_of(operated, recover_after=1)
+    assert held(loop.scan(stale("T")), "PV T")
+    assert loop.scan(sample()).mode is Mode.AUTO
+    assert loop.scan(stale("T")).mode is Mode.AUTO
+
+
+def test_old_numbers_make_no_pv_frozen(operated: Controller) -> None:
+    loop = loop_of(operated, guards=(*default_guards(operated.manifest), Frozen(operated.manifest.pv[:1], 3)))
+    loop.scan(sample())
+    for _ in range(5):
+        assert not loop.scan(stale("T")).bridged
+    assert not loop.scan(sample()).bridged
+
+
+@pytest.mark.parametrize("fresh", [np.ones(2), np.array([1.0, 0.5, 1.0]), "new", [1, None, 1]], ids=str)
+def test_a_fresh_that_is_none_refuses_the_sample(operated: Controller, fresh: Any) -> None:
+    loop = loop_of(operated)
+    loop.scan(sample())
+    assert loop.scan(sample(fresh=fresh)).mode is Mode.HOLD
+
+
+def test_any_other_law_takes_the_number_that_stands_there(not_operated: Controller) -> None:
+    assert loop_of(not_operated).scan(stale("T")).mode is Mode.AUTO
+    assert loop_of(not_operated).scan(stale("T", t=999.0)).mode is Mode.HOLD
+
+
 READINGS = st.sampled_from([300.0, 305.0, NAN, 500.0, np.inf])
 
 
