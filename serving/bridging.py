@@ -136,9 +136,9 @@ class Bridging:
         return refused(guards, sample, past) or "", sample
 
     def _stale(self, sample: Sample) -> NDArray[np.bool_]:
-        """Which PVs have no new reading; LoopError for a ``fresh`` that is none."""
+        """Whether each PV (n_pv,) has no new reading; LoopError for a ``fresh`` that is none."""
         if sample.fresh is None:
-            return self._all_fresh == 0
+            return np.zeros(len(self._last), dtype=bool)
         fresh = np.asarray(sample.fresh)
         if fresh.shape != self._last.shape or not np.isin(fresh, (0, 1)).all():
             raise LoopError(f"fresh is {shown(sample.fresh)}; it needs 0 or 1 for each of {len(self._last)} PVs")

@@ -122,7 +122,8 @@ for (const fresh of [undefined, [1, 0], [0, 0], [1, 0.5], [1], [NaN, 1]]) {
 }
 const other = (entries) => Object.create(controller, { operate: { value: new Operate(entries) } });
 const valve = { group: "mv", signal: "u0", unit: "", low: 0, high: 1 };
-const taken = [[], [{ ...valve, what: "use", default: 1 }, { ...valve, what: "cost", default: 0.5 }], manifest.operate].map((entries) => {
+const some = [{ ...valve, what: "use", default: 1 }, { ...valve, what: "cost", default: 0.5 }];
+const taken = [[], some, manifest.operate].map((entries) => {
   loop.replace(other(entries));
   return loop.operate.filter((value, i) => value !== entries[i].default);
 });
