@@ -180,7 +180,7 @@ class Successor:
     """Steps a new controller on the samples of the one in charge; its MV is shown and not written.
 
     It is ready after ``trial`` good scans in a row: a scan without a sample, one that its own ``guards`` refuse, or one
-    that it cannot compute, starts the count and its law anew. It takes by name the values that operators have changed.
+    that it cannot compute, starts the count and its law anew. It takes by name the values that somebody has set.
     """
 
     def __init__(
@@ -201,15 +201,14 @@ class Successor:
         sp: Array,
         applied: Array,
         past: Collection[Sample] = (),
-        operated: tuple[Operate, Array] | None = None,
+        wishes: Mapping[str, float] | None = None,
     ) -> None:
-        """One scan; ``past`` ends with the sample before it, ``operated`` is of the controller in charge."""
-        if operated is not None:
-            try:
-                self.operate = self.operating.taken_over(*operated)
-            except ContractError as error:
-                self.miss(first_line(error))
-                return
+        """One scan; ``past`` ends with the sample before it, ``wishes`` are values of ``operate`` that somebody set."""
+        try:
+            self.operate = self.operating.taken_over(wishes or {})
+        except ContractError as error:
+            self.miss(first_line(error))
+            return
         readings = self.bridging.look(sample, self.guards, past, self.operate)
         if readings.reason:
             self.miss(readings.reason)
@@ -245,8 +244,9 @@ class ActiveController:
     """The controller in charge with the state of its law, its guards and the samples that they look back to.
 
     ``guards`` are a host's own, or what makes them for a controller's manifest: they are then made anew for each
-    controller that takes over. ``bridge_s`` and ``critical`` are of ``Bridging``. ``operate`` (n_operate,) is what
-    operators have changed of the law; whoever takes over has it by name, and its own defaults for the rest.
+    controller that takes over. ``bridge_s`` and ``critical`` are of ``Bridging``. ``wishes`` are the values of
+    ``operate`` that somebody has set since the loop began, by name: they outlast a law that lacks them. ``operate``
+    (n_operate,) is those that the law in charge has, and its own defaults for the rest.
     """
 
     def __init__(
@@ -257,6 +257,7 @@ class ActiveController:
         self.successor: Successor | None = None  # tried beside the controller
         self.operating = Operate(controller.manifest.operate)
         self.operate = self.operating.default
+        self.wishes: dict[str, float] = {}
         self._made = guards if callable(guards) else None
         self.guards: tuple[Guard, ...] = tuple(guards(controller.manifest) if callable(guards) else guards)
         self._bridging = Bridging(controller.manifest, bridge_s, critical)
@@ -283,6 +284,11 @@ class ActiveController:
         except ContractError as error:
             raise LoopError(first_line(error)) from error
 
+    def set_operate(self, values: Mapping[str, float]) -> None:
+        """Change some of ``operate``; LoopError as ``operate_with``, and nothing is changed then."""
+        self.operate = self.operate_with(values)
+        self.wishes |= {name: float(self.operate[self.operating.places[name]]) for name in values}
+
     def step(self, readings: Readings, sp: Array, applied: Array) -> Step:
         """One step of the law. It raises what the law raises; ``forget`` then, as the state is of no use any more."""
         sample = readings.sample
@@ -299,7 +305,7 @@ class ActiveController:
         new = self.successor
         if new is None:
             return None
-        new.step(sample, sp, applied, self._before, (self.operating, self.operate))
+        new.step(sample, sp, applied, self._before, self.wishes)
         if new.ready:
             self.replaced, self.successor = self.controller, None
             self.controller, self._state = new.controller, new.state

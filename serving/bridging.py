@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite
 from typing import Self, TypeAlias
 
@@ -45,6 +45,9 @@ class Bridging:
     again. The sample is refused where no PV is left that the operator has in use, and where a PV is gone for longer
     than ``bridge_s`` that is ``critical`` or has no ``use``. A PV that was never read well is not bridged.
 
+    A PV without a new reading (``Sample.fresh``) is predicted, too, for as long as it takes, and is neither bridged nor
+    shed by that. One whose last reading was bad stays bad until the next good one.
+
     Parameters
     ----------
     manifest
@@ -74,6 +77,8 @@ class Bridging:
         self.critical = tuple(critical)
         self._last = np.full(len(manifest.pv), np.nan)  # the last good number of each PV
         self._gone = np.zeros(len(manifest.pv))  # periods since then, the present one included
+        self._excused = np.zeros(len(manifest.pv))  # of those without a new reading, while nothing was wrong
+        self._why = dict[int, str]()  # of PVs whose last reading was bad
         self._all_fresh = np.ones(len(manifest.pv))
         self._apart = "fresh" in manifest.inputs
         self._of_use = {e.signal: i for i, e in enumerate(manifest.operate) if e.group == "cv" and e.what == "use"}
@@ -82,6 +87,7 @@ class Bridging:
         """The same readings for another law over the same PVs."""
         made = type(self)(manifest, self.bridge_s, self.critical)
         made._last, made._gone = self._last.copy(), self._gone.copy()
+        made._excused, made._why = self._excused.copy(), dict(self._why)
         return made
 
     def missed(self, periods: int = 1) -> None:
@@ -121,31 +127,58 @@ class Bridging:
         if reason:
             return reason if isinstance(reason, str) else str(reason), sample
         if self._apart:
-            why, sample = refused_apart(guards, sample, past, self.manifest.pv)
-            return why or "", sample
+            stale = self._stale(sample)
+            pv = np.where(stale, self._last, sample.pv) if stale.any() and np.shape(sample.pv) == (n,) else sample.pv
+            seen = replace(sample, pv=pv, last_pv=self._last.copy(), since=self._gone + 1.0)
+            why, judged = refused_apart(guards, seen, past, self.manifest.pv)
+            return why or "", sample if judged.bad_pv is sample.bad_pv else replace(sample, bad_pv=judged.bad_pv)
+        sample = sample if sample.fresh is None else replace(sample, fresh=None)  # this law takes all numbers as new
         return refused(guards, sample, past) or "", sample
+
+    def _stale(self, sample: Sample) -> NDArray[np.bool_]:
+        """Whether each PV (n_pv,) has no new reading; LoopError for a ``fresh`` that is none."""
+        if sample.fresh is None:
+            return np.zeros(len(self._last), dtype=bool)
+        fresh = np.asarray(sample.fresh)
+        if fresh.shape != self._last.shape or not np.isin(fresh, (0, 1)).all():
+            raise LoopError(f"fresh is {shown(sample.fresh)}; it needs 0 or 1 for each of {len(self._last)} PVs")
+        return np.asarray(fresh == 0)
 
     def _bridged(self, sample: Sample, operate: Array) -> Readings:
         """The readings of a sample that is good but for single PVs."""
         m = self.manifest
         pv = np.array(sample.pv, dtype=np.float64, ndmin=1)
-        if not sample.bad_pv and pv.shape == self._last.shape and isfinite(pv.sum()):
+        if not sample.bad_pv and sample.fresh is None and pv.shape == self._last.shape and isfinite(pv.sum()):
             self._last[:] = pv
             self._gone.fill(0.0)
+            self._excused.fill(0.0)
+            self._why.clear()
             return Readings(sample, "", pv, self._all_fresh)
-        bad = np.array([bool(why) for why in sample.bad_pv] or np.zeros(len(m.pv)), dtype=bool) | ~np.isfinite(pv)
-        self._last[~bad], self._gone[~bad] = pv[~bad], -1.0
+        told = np.array([bool(why) for why in sample.bad_pv] or np.zeros(len(m.pv)), dtype=bool)
+        stale = self._stale(sample) & ~told
+        good = ~told & ~stale & np.isfinite(pv)
+        for i, s in enumerate(m.pv):
+            if good[i]:
+                self._why.pop(i, None)
+            elif not stale[i]:
+                self._why[i] = (
+                    sample.bad_pv[i] if told[i] else Fault(f"PV {s.name} is {pv[i]}", "number", f"PV {s.name}")
+                )
+        self._last[good], self._gone[good], self._excused[good] = pv[good], -1.0, 0.0
         self._gone += 1.0
-        if not bad.any():  # a sum of finite numbers may overflow
+        self._excused[[i for i in np.flatnonzero(stale).tolist() if i not in self._why]] += 1.0
+        if good.all():  # a sum of finite numbers may overflow
             return Readings(sample, "", pv, self._all_fresh)
         bridged, shed = dict[str, str](), dict[str, str]()
-        for i in np.flatnonzero(bad).tolist():
+        for i in np.flatnonzero(~good).tolist():
             name = m.pv[i].name
-            why = sample.bad_pv[i] if sample.is_bad(i) else ""
-            why = why or Fault(f"PV {name} is {pv[i]}", "number", f"PV {name}")
+            why = self._why.get(i, "")
             if np.isnan(self._last[i]):
+                why = why or Fault(f"PV {name} has no new reading", "fresh", f"PV {name}")
                 return Readings(sample, reworded(why, f"{why}; it has not been read yet"))
-            if (self._gone[i] - 1) * m.period_s < self.bridge_s:
+            if not why:
+                continue
+            if (self._gone[i] - self._excused[i] - 1) * m.period_s < self.bridge_s:
                 bridged[name] = why
             elif name in self.critical or name not in self._of_use:
                 lost = "the loop needs this PV" if name in self.critical else "the law cannot leave this PV out"
@@ -156,4 +189,4 @@ class Bridging:
         if shed and wanted and not set(wanted) - set(shed):
             why = next(iter(shed.values()))
             return Readings(sample, reworded(why, f"{why}; no controlled variable is left"))
-        return Readings(sample, "", np.where(bad, self._last, pv), (~bad).astype(np.float64), bridged, shed)
+        return Readings(sample, "", np.where(good, pv, self._last), good.astype(np.float64), bridged, shed)

@@ -91,6 +91,13 @@ class Sample:
     the page: an OPC UA status for each PV, then each MV, then each measured disturbance that is read; empty: the
     endpoint has none. ``bad_pv`` says for each PV why its reading alone is not trusted, empty where it is; an empty
     tuple: all are. A law that reads ``fresh`` goes on without these, see ``loopwright.serving.bridging``.
+
+    ``fresh`` is for such a law, too: 0 says that the number of a PV is no new reading, as of an analyser between two
+    results. It is neither judged nor used, the law predicts the PV for as long as it takes, and nothing is wrong.
+    Any other law takes the number that stands there.
+
+    ``last_pv`` and ``since`` are for guards, and none of the endpoint's: the loop of such a law shows by them the last
+    good number of each PV, NaN where there is none, and how many periods ago it was read.
     """
 
     pv: Array  # shape: (n_pv,)
@@ -101,16 +108,24 @@ class Sample:
     quality: tuple[int, ...] = ()
     late: str = ""
     bad_pv: tuple[str, ...] = ()  # shape: (n_pv,), or empty
+    fresh: Array | None = None  # shape: (n_pv,), 1 or 0; None: all are
+    last_pv: Array | None = None  # shape: (n_pv,)
+    since: Array | None = None  # shape: (n_pv,), in periods, 1 or more
 
     def is_bad(self, i: int) -> bool:
-        """Whether the reading of PV ``i`` is known to be bad: no guard judges it again."""
-        return bool(self.bad_pv) and bool(self.bad_pv[i])
+        """Whether the reading of PV ``i`` is known to be bad, or none: no guard judges it again."""
+        return bool(self.bad_pv and self.bad_pv[i]) or self.is_stale(i)
+
+    def is_stale(self, i: int) -> bool:
+        """Whether the number of PV ``i`` is no new reading, by the host's own word."""
+        return self.fresh is not None and not self.fresh[i]
 
 
 class Guard(Protocol):
     """One reason not to act: a text, or a ``loopwright.serving.guard.Fault``, which also says which reason it is.
 
     A fault with the subject "PV T" speaks against the reading of this PV alone; a law that reads ``fresh`` bridges it.
+    A guard that speaks against a PV that is known to be bad is asked again with the last good number in its place.
     """
 
     @property
@@ -211,7 +226,7 @@ class Frozen:
         if len(recent) < self.memory:
             return None
         for i, s in enumerate(self.signals):
-            if all(old.pv[i] == sample.pv[i] for old in recent) and not sample.is_bad(i):
+            if all(old.pv[i] == sample.pv[i] and not old.is_stale(i) for old in recent) and not sample.is_bad(i):
                 words = f"PV {s.name} is frozen at {sample.pv[i]:.6g} {s.unit} for {self.samples} samples"
                 return Fault(words, "frozen", f"PV {s.name}")
         return None
@@ -244,7 +259,10 @@ class Fresh:
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """No PV moves by more than ``largest`` [pv units] from one sample to the next."""
+    """No PV moves by more than ``largest`` [pv units] from one sample to the next.
+
+    Where the sample has ``last_pv``, it is compared with that: ``largest`` is then allowed for each period since.
+    """
 
     signals: tuple[Signal, ...]
     largest: tuple[float, ...]
@@ -252,14 +270,20 @@ class Rate:
 
     def check(self, sample: Sample, past: Collection[Sample]) -> str | None:
         """Why not: faster than the process can, so it is the sensor."""
-        if not past:
+        if sample.last_pv is not None and sample.since is not None:
+            last, since = sample.last_pv, sample.since.tolist()
+        elif past:
+            last, since = list(past)[-1].pv, [1.0] * len(self.signals)
+        else:
             return None
-        last = list(past)[-1]
-        moves = np.abs(sample.pv - last.pv).tolist()
+        moves = np.abs(sample.pv - last).tolist()
         for i, (s, move, largest) in enumerate(zip(self.signals, moves, self.largest, strict=True)):
-            if not move <= largest and not (sample.is_bad(i) or last.is_bad(i)):
-                words = f"PV {s.name} moved by {move:.6g} {s.unit} in one sample; allowed are {largest:g} {s.unit}"
-                return Fault(words, "rate", f"PV {s.name}")
+            if not move <= largest * since[i] and not (sample.is_bad(i) or np.isnan(last[i])):
+                over = "one sample" if since[i] == 1 else f"{since[i]:g} samples"
+                most = f"{largest * since[i]:g} {s.unit}"
+                words = f"PV {s.name} moved by {move:.6g} {s.unit} in {over}; allowed are {most}"
+                lasts = f"PV {s.name} moved by more than {largest:g} {s.unit} a sample"
+                return Fault(words, "rate", f"PV {s.name}", lasts if sample.last_pv is not None else "")
         return None
 
 
@@ -285,19 +309,27 @@ def refused_apart(
 ) -> tuple[str | None, Sample]:
     """Why a sample is refused, or None; and the sample, with what speaks against single PVs alone in ``bad_pv``.
 
-    ``signals`` are the PVs. A guard whose fault has one of them for its subject is asked again without that PV.
+    ``signals`` are the PVs. A guard whose fault has one of them for its subject is asked again without that PV. A guard
+    of somebody's own may not know ``bad_pv``: it is asked with the last good numbers in the place of the bad ones, so
+    that the first bad PV hides no second one, and the sample is refused where that does not help.
     """
     places = {f"PV {s.name}": i for i, s in enumerate(signals)}
     for guard in guards:
-        while reason := refused((guard,), sample, past):
+        shown = sample
+        while reason := refused((guard,), shown, past):
             place = places.get(reason.subject) if isinstance(reason, Fault) else None
             if place is None:
                 return reason, sample
-            if sample.is_bad(place):  # a guard that looks at all PVs, whatever is known of them
-                break
-            bad = list(sample.bad_pv or ("" for _ in signals))
-            bad[place] = reason
-            sample = replace(sample, bad_pv=tuple(bad))
+            if not sample.is_bad(place):
+                bad = list(sample.bad_pv or ("" for _ in signals))
+                bad[place] = reason
+                sample = replace(sample, bad_pv=tuple(bad))
+                shown = replace(shown, bad_pv=sample.bad_pv)
+            elif sample.last_pv is None or shown.pv[place] == sample.last_pv[place] or np.isnan(sample.last_pv[place]):
+                return reason, sample
+            else:
+                known = [sample.is_bad(i) for i in range(len(signals))]
+                shown = replace(shown, pv=np.where(known, sample.last_pv, sample.pv))
     return None, sample
 
 

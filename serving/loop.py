@@ -231,7 +231,7 @@ class ControlLoop:
         No transfer begins: the law moves the MVs by no more than it may. LoopError for a law that does not read
         ``operate``, an unknown name, and a value that is not allowed; then nothing is changed.
         """
-        self._active.operate = self.operate_with(values)
+        self._active.set_operate(values)
 
     def operate_with(self, values: Mapping[str, float]) -> Array:
         """``operate`` (n_operate,) as ``set_operate`` would leave it; LoopError where that would refuse."""

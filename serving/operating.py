@@ -43,14 +43,12 @@ class Operate:
             found[self.places[name]] = number
         return self.checked(found)
 
-    def taken_over(self, others: Operate, values: Array) -> Array:
-        """The values (n,) by name of another law's ``others`` with ``values``, the defaults where it has none.
+    def taken_over(self, wishes: Mapping[str, float]) -> Array:
+        """The values (n,) of those ``wishes`` that this law has, and its own defaults for the rest.
 
         ContractError where one of them is outside its range here.
         """
-        if others.entries == self.entries:
-            return values
-        return self.with_values({n: float(values[i]) for n, i in others.places.items() if n in self.places})
+        return self.with_values({name: value for name, value in wishes.items() if name in self.places})
 
     def checked(self, values: ArrayLike) -> Array:
         """``values`` as float64 (n,); ContractError with the name of the first that is wrong.

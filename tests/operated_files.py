@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from identified_models import random_model
-from operated_law import ENTRIES, OTHER_ENTRIES, PLANT, OperatedLaw
+from operated_law import ENTRIES, NARROW_ENTRIES, OTHER_ENTRIES, PLANT, OperatedLaw
 from predictive_loops import law_of
 from torch import Tensor
 
@@ -33,6 +33,12 @@ def operated(tmp_path_factory: pytest.TempPathFactory) -> Controller:
 def otherwise_operated(tmp_path_factory: pytest.TempPathFactory) -> Controller:
     """A law with ``OTHER_ENTRIES``, of the same signals."""
     return _exported(OperatedLaw(OTHER_ENTRIES), tmp_path_factory.mktemp("other"))
+
+
+@pytest.fixture(scope="session")
+def narrow(tmp_path_factory: pytest.TempPathFactory) -> Controller:
+    """A law with ``NARROW_ENTRIES``, of the same signals."""
+    return _exported(OperatedLaw(NARROW_ENTRIES), tmp_path_factory.mktemp("narrow"))
 
 
 @pytest.fixture(scope="session")

@@ -35,6 +35,10 @@ OTHER_ENTRIES = (  # of a law that lacks some, has another one, and other defaul
     OperateEntry("cv", "p", "use", "", 1.0, 0.0, 1.0),
     OperateEntry("law", "", "caution", "", 2.0, 0.25, 4.0),
 )
+NARROW_ENTRIES = (  # of a law whose engineered range does not hold the defaults of ``ENTRIES``
+    OperateEntry("mv", "valve", "low", "%", 20.0, 10.0, 80.0),
+    OperateEntry("mv", "valve", "high", "%", 80.0, 10.0, 80.0),
+)
 
 
 class OperatedLaw(ControlLaw):

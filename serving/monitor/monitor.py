@@ -146,7 +146,7 @@ class Monitor:
         self._follow(time_s, sample, command)
         if command.mode is not Mode.SHADOW:
             self.hold.add(float(command.mode is Mode.HOLD))
-        apart = command.bridged or command.shed  # a law that goes on without a reading is no measure of itself
+        apart = _without_reading(sample, command)  # a law that goes on without a reading is no measure of itself
         if sample is None or command.mode is not Mode.AUTO or command.law_mv is None or apart:
             if command.mode in {Mode.SHADOW, Mode.MANUAL}:  # a batch's end; a fault is none
                 self.batches.end(time_s)
@@ -186,7 +186,7 @@ class Monitor:
         if before is None or applied.shape != before.shape or not np.isfinite(applied).all():
             return
         error = None
-        if command.mode is Mode.AUTO and not (command.bridged or command.shed):
+        if command.mode is Mode.AUTO and not _without_reading(sample, command):
             off = np.abs(np.asarray(sample.pv, dtype=np.float64)[: len(command.sp)] - command.sp) / self._sp_span
             error = float(off.max())
         self.following.add(applied, before, error, time_s)
@@ -332,3 +332,9 @@ class Monitor:
 
 def _finite(value: float | None) -> float | None:
     return value if value is None or isfinite(value) else None
+
+
+def _without_reading(sample: Sample | None, command: Command) -> bool:
+    """Whether a PV of this scan has no new and good reading."""
+    old = sample is not None and sample.fresh is not None and not np.all(sample.fresh)
+    return old or bool(command.bridged or command.shed)

@@ -118,6 +118,10 @@ class OpcUaEndpoint:
         return min(max(2 * self._slowest_s, least), most)
 
     # ------------------------------------------------------------------ the loop's side
+    def serve(self, law: Manifest) -> None:
+        """The law in charge is this one now: whether it goes on without a PV whose reading alone is bad."""
+        self._sampling.apart = "fresh" in law.inputs
+
     def start(self) -> None:
         """Begin to connect; returns at once."""
         self._thread.start()
@@ -167,7 +171,8 @@ class OpcUaEndpoint:
             return sample
         said = values.bad_pv or ("",) * len(names)
         bad = [
-            why or (Fault(f"{name} is older than {self.max_age_s * self.speed:.3g} s", "age", name) * (name in late))
+            why
+            or (Fault(f"{name} is older than {self.max_age_s * self.speed:.3g} s", "age", name) if name in late else "")
             for name, why in zip(names, said, strict=True)
         ]
         age = now - values.arrived_s + max(rest)

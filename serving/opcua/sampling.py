@@ -121,7 +121,7 @@ class NodeSampling:
     def __init__(self, manifest: Manifest, server: Server, nodes: Nodes, nameplates: Nameplates | None = None) -> None:
         self.manifest, self.server, self.nodes = manifest, server, nodes
         self.nameplates = nameplates or Nameplates(nodes, manifest)
-        self.apart = "fresh" in manifest.inputs  # whether a law goes on without a PV whose reading alone is bad
+        self.apart = "fresh" in manifest.inputs  # whether the law goes on without a PV whose reading alone is bad
         self._watched = float("nan"), 0  # the watchdog, and for how many readings it has stood there
         self._dead, self._slow = "", False  # why the plant counts as dead; whether its watchdog has moved since
 

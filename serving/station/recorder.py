@@ -104,8 +104,8 @@ class Recorder:
                 continue
             if out is not None:
                 why = lasting({**command.bridged, **command.shed}[name])
-                words = f"PV {name} is left out" if out else f"PV {name} is bridged"
-                self.note("fault", "loop", f"{words}: {why}", alarm=alarm if out else "", raised=out)
+                words = f"PV {name} is left out" if out else f"{'over: ' if before else ''}PV {name} is bridged"
+                self.note("fault", "loop", f"{words}: {why}", alarm=alarm if out or before else "", raised=out)
             else:
                 words = f"PV {name} is read again"
                 self.note("fault", "loop", f"over: {words}" if before else words, alarm=alarm if before else "")

@@ -34,7 +34,8 @@ class NodeRequests:
 
     The set points and the values of ``operate`` that stand there when the loop begins are requests, too; the mode is
     none. The values of a server that has started anew are its defaults: nobody asked for them, and they are no request
-    until they change.
+    until they change. A ``use`` of ``operate`` is a contact, which shows how the plant stands: it is a request also
+    where it stands otherwise after the start than before it.
     """
 
     def __init__(self) -> None:
@@ -46,10 +47,16 @@ class NodeRequests:
         """The requests of these values; empty where there are none."""
         if values.starts != self.starts:
             self.starts = values.starts
-            self._stands.clear()
+            self._stands = {
+                name: value for name, value in self._stands.items() if name.startswith("operate ") and is_contact(name)
+            }
         points = {n: v for n, v in values.asked_sp.items() if self._changed(f"SP {n}", v, first=self.starts == 0)}
         first = self.starts == 0
-        operate = {n: v for n, v in values.asked_operate.items() if self._changed(f"operate {n}", v, first=first)}
+        operate = {
+            n: v
+            for n, v in values.asked_operate.items()
+            if self._changed(f"operate {n}", v, first=first or is_contact(n))
+        }
         mode = values.asked_mode
         return Asked(points, mode if mode and self._changed(MODE, mode, first=False) else "", operate)
 
@@ -63,6 +70,11 @@ class NodeRequests:
         before = self._stands.get(name)
         self._stands[name] = value
         return first if before is None else before != value
+
+
+def is_contact(name: str) -> bool:
+    """Whether a node of ``operate`` shows a state of the plant, as that a valve is in local, and not what is wanted."""
+    return name.endswith(".use")
 
 
 # -------------------------------------------------------------------------------------------- by commands and the page

@@ -258,6 +258,8 @@ class Station:
         self._moved(self.loop)
         self.scans, self._faults = self.scans + 1, self._faults + bool(command.fault)
         seen, stepped = (sample, command, time.time()), self.recorder.controller
+        if self.loop.controller is not stepped:
+            self.endpoint.serve(self.loop.controller.manifest)
         if not np.isnan(command.mv).any():
             self._left_at = command.mv
         try:

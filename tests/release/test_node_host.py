@@ -104,7 +104,7 @@ import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
 const [host, file] = process.argv.slice(1);
 const ort = createRequire(host)("onnxruntime-node");
-const { Controller, Loop } = await import(host.replace("node/host", "javascript/controller"));
+const { Controller, Loop, Operate } = await import(host.replace("node/host", "javascript/controller"));
 const manifest = JSON.parse(readFileSync(file.replace("onnx", "json")));
 const controller = await Controller.load(ort, readFileSync(file), manifest, "cpu");
 const loop = new Loop(controller, { sp: [0, 0], mode: "AUTO", recoverAfter: 1 });
@@ -120,8 +120,17 @@ for (const fresh of [undefined, [1, 0], [0, 0], [1, 0.5], [1], [NaN, 1]]) {
   const scan = await loop.scan({ ...good, fresh });
   found.push([scan.mv[0], scan.mode, scan.law && scan.law[1]]);
 }
-loop.replace(controller);
-console.log(JSON.stringify({ refused, unchanged, found, replaced: byDefault() }));
+const other = (entries) => Object.create(controller, { operate: { value: new Operate(entries) } });
+const valve = { group: "mv", signal: "u0", unit: "", low: 0, high: 1 };
+const some = [{ ...valve, what: "use", default: 1 }, { ...valve, what: "cost", default: 0.5 }];
+const taken = [[], some, manifest.operate].map((entries) => {
+  loop.replace(other(entries));
+  return loop.operate.filter((value, i) => value !== entries[i].default);
+});
+let narrow = "";
+try { loop.replace(other([{ ...valve, what: "use", default: 1, low: 1 }])); } catch (error) { narrow = error.because; }
+const kept = loop.operate.length;
+console.log(JSON.stringify({ refused, unchanged, found, taken, narrow, kept: kept === manifest.operate.length }));
 """
 
 
@@ -134,7 +143,8 @@ def test_a_program_around_the_node_host_steers_its_law(operated_file: Path) -> N
     told = json.loads(done.stdout)
     assert told["refused"] == ["input"] * 5
     assert told["unchanged"]
-    assert told["replaced"]
+    assert told["taken"] == [[], [0], [0]]  # u0.use, which somebody set, and nothing else
+    assert (told["narrow"], told["kept"]) == ("input", True)
     assert [mv for mv, *_ in told["found"]] == [0.3] * 6  # out of use, or held
     assert [mode for _, mode, _ in told["found"]] == ["AUTO"] * 3 + ["HOLD"] * 3
 

@@ -195,7 +195,76 @@ def test_guards_that_look_back_speak_of_one_pv_alone(operated: Controller) -> No
         assert list(loop.scan(sample(p=4.0 + next(at), x=next(at))).bridged) == ["T"]  # frozen
     assert not loop.scan(sample(t=301.0, p=4.0 + next(at), x=next(at))).bridged
     assert list(loop.scan(sample(t=320.0, p=4.0 + next(at), x=next(at))).bridged) == ["T"]  # too fast
-    assert not loop.scan(sample(t=321.0, p=4.0 + next(at), x=next(at))).bridged  # as after any fault: it stands there
+    assert list(loop.scan(sample(t=322.0, p=4.0 + next(at), x=next(at))).bridged) == ["T"]  # 21 K in two periods
+    assert not loop.scan(sample(t=321.0, p=4.0 + next(at), x=next(at))).bridged  # 20 K in three
+
+
+def rated(operated: Controller, **options: Any) -> ControlLoop:
+    """A loop in which T may move by 5 K a period."""
+    guards = (*default_guards(operated.manifest), Rate(operated.manifest.pv, (5.0, 5.0, 5.0)))
+    return loop_of(operated, guards=guards, bridge_s=100.0, recover_after=1, **options)
+
+
+def test_a_pv_that_jumped_and_stays_is_good_again_once_it_can_have_got_there(operated: Controller) -> None:
+    loop = rated(operated)
+    loop.scan(sample())
+    moved = [loop.scan(sample(t=352.0)) for _ in range(12)]
+    assert [bool(c.bridged) for c in moved] == [True] * 10 + [False] * 2  # 52 K, of 5 K for each of 11 periods
+    assert {law_sees(loop, c).pv["T"] for c in moved[:10]} == {300.0}
+    assert law_sees(loop, moved[10]).fresh["T"] == 1.0
+
+
+def test_a_jump_is_not_forgotten_over_a_fault_of_the_whole_sample(operated: Controller) -> None:
+    loop = rated(operated)
+    loop.scan(sample())
+    assert loop.scan(sample(t=380.0)).bridged
+    assert loop.scan(sample(t=380.0, valve=NAN)).mode is Mode.HOLD
+    loop.miss("the plant cannot be read")
+    assert list(loop.scan(sample(t=380.0)).bridged) == ["T"]
+    assert not loop.scan(sample(t=310.0)).bridged
+
+
+def test_a_jump_that_was_read_as_bad_first_is_one_all_the_same(operated: Controller) -> None:
+    loop = rated(operated)
+    loop.scan(sample())
+    assert loop.scan(sample(t=NAN)).bridged
+    assert list(loop.scan(sample(t=380.0)).bridged) == ["T"]
+    assert not loop.scan(sample(t=314.0)).bridged
+
+
+class OneAfterTheOther:
+    """A guard of somebody's own: it names the first PV that is too high, and knows of no ``bad_pv``."""
+
+    memory = 0
+
+    def check(self, sample: Sample, past: Any) -> str | None:
+        for name, value, most in zip(("T", "p", "x"), sample.pv, (350.0, 6.0, 1.0), strict=True):
+            if not value <= most:
+                return Fault(f"PV {name} is too high", "own", f"PV {name}")
+        return None
+
+
+@pytest.mark.parametrize("first", [{"t": 360.0}, {"t": NAN}, {"t": 360.0, "bad_pv": ("bad", "", "")}], ids=str)
+def test_a_guard_of_ones_own_hides_no_second_bad_pv(operated: Controller, first: dict[str, Any]) -> None:
+    loop = loop_of(operated, guards=lambda m: (*default_guards(m), OneAfterTheOther()))
+    loop.scan(sample())
+    for _ in range(2):
+        command = loop.scan(sample(p=9.0, x=3.0, **first))
+        assert sorted(command.bridged) == ["T", "p", "x"]
+        assert law_sees(loop, command).pv == {"T": 300.0, "p": 5.0, "x": 0.5}
+    assert list(loop.scan(sample(**first)).bridged) == ["T"]
+
+
+def test_a_guard_of_ones_own_that_no_good_number_contents_refuses_the_sample(operated: Controller) -> None:
+    class Never:
+        memory = 0
+
+        def check(self, sample: Sample, past: Any) -> str | None:
+            return Fault("T is odd", "odd", "PV T") if sample.pv[1] > 5 else None
+
+    loop = loop_of(operated, guards=[Never()])
+    loop.scan(sample())
+    assert held(loop.scan(sample(p=6.0)), "PV T")
 
 
 def test_a_guard_of_ones_own_that_looks_at_every_pv_ends(operated: Controller) -> None:
@@ -219,6 +288,66 @@ def test_a_guard_of_ones_own_that_looks_at_every_pv_ends(operated: Controller) -
 def test_settings_that_cannot_be_are_refused(operated: Controller, options: dict[str, Any]) -> None:
     with pytest.raises(LoopError):
         loop_of(operated, **options)
+
+
+# ------------------------------------------------------------------------------------------------------- no new reading
+def stale(*names: str, **changed: Any) -> Sample:
+    return sample(**changed, fresh=np.array([float(n not in names) for n in ("T", "p", "x")]))
+
+
+@pytest.mark.parametrize("number", [300.0, 333.0, 999.0, NAN])
+def test_a_pv_without_a_new_reading_is_predicted_for_as_long_as_it_takes(operated: Controller, number: float) -> None:
+    guards = (*default_guards(operated.manifest), Rate(operated.manifest.pv, (1.0, 1.0, 1.0)))
+    loop = loop_of(operated, guards=guards, critical=["T", "x"])
+    loop.scan(sample(t=301.0))
+    for _ in range(5 * BRIDGE):
+        command = loop.scan(stale("T", "x", t=number))
+        assert (command.mode, command.fault, dict(command.bridged), dict(command.shed)) == (Mode.AUTO, "", {}, {})
+        seen = law_sees(loop, command)
+        assert (seen.fresh, seen.pv["T"]) == ({"T": 0.0, "p": 1.0, "x": 0.0}, 301.0)
+        assert seen.operate["T.use"] == 1.0
+    command = loop.scan(sample(t=310.0))
+    assert (law_sees(loop, command).fresh["T"], law_sees(loop, command).pv["T"]) == (1.0, 310.0)
+
+
+def test_a_bad_reading_after_old_ones_has_its_whole_bridge_and_stays_bad(operated: Controller) -> None:
+    loop = loop_of(operated)
+    loop.scan(sample())
+    for _ in range(20):
+        loop.scan(stale("T"))
+    assert list(loop.scan(sample(t=NAN)).bridged) == ["T"]
+    found = [loop.scan(stale("T")) for _ in range(BRIDGE + 1)]
+    assert [list(c.bridged) for c in found] == [["T"], ["T"], [], []]
+    assert [list(c.shed) for c in found] == [[], [], ["T"], ["T"]]
+    assert not loop.scan(sample()).shed
+    assert not loop.scan(stale("T")).bridged
+
+
+def test_a_pv_that_was_never_read_is_not_predicted(operated: Controller) -> None:
+    loop = loop_of(operated, recover_after=1)
+    assert held(loop.scan(stale("T")), "PV T")
+    assert loop.scan(sample()).mode is Mode.AUTO
+    assert loop.scan(stale("T")).mode is Mode.AUTO
+
+
+def test_old_numbers_make_no_pv_frozen(operated: Controller) -> None:
+    loop = loop_of(operated, guards=(*default_guards(operated.manifest), Frozen(operated.manifest.pv[:1], 3)))
+    loop.scan(sample())
+    for _ in range(5):
+        assert not loop.scan(stale("T")).bridged
+    assert not loop.scan(sample()).bridged
+
+
+@pytest.mark.parametrize("fresh", [np.ones(2), np.array([1.0, 0.5, 1.0]), "new", [1, None, 1]], ids=str)
+def test_a_fresh_that_is_none_refuses_the_sample(operated: Controller, fresh: Any) -> None:
+    loop = loop_of(operated)
+    loop.scan(sample())
+    assert loop.scan(sample(fresh=fresh)).mode is Mode.HOLD
+
+
+def test_any_other_law_takes_the_number_that_stands_there(not_operated: Controller) -> None:
+    assert loop_of(not_operated).scan(stale("T")).mode is Mode.AUTO
+    assert loop_of(not_operated).scan(stale("T", t=999.0)).mode is Mode.HOLD
 
 
 READINGS = st.sampled_from([300.0, 305.0, NAN, 500.0, np.inf])

@@ -42,5 +42,6 @@ def test_what_stands_in_the_nodes_of_operate_is_a_wish_at_first_and_when_it_chan
     asked = NodeRequests()
     assert asked.of(values(operate={"T.low": 1.0, "T.use": 1.0})).operate == {"T.low": 1.0, "T.use": 1.0}
     assert asked.of(values(operate={"T.low": 1.0, "T.use": 0.0})).operate == {"T.use": 0.0}
-    assert asked.of(values(operate={"T.low": 0.0, "T.use": 1.0}, starts=1)).operate == {}
-    assert asked.of(values(operate={"T.low": 2.0, "T.use": 1.0}, starts=1)).operate == {"T.low": 2.0}
+    assert asked.of(values(operate={"T.low": 0.0, "T.use": 0.0}, starts=1)).operate == {}
+    assert asked.of(values(operate={"T.low": 2.0, "T.use": 0.0}, starts=1)).operate == {"T.low": 2.0}
+    assert asked.of(values(operate={"T.low": 0.0, "T.use": 1.0}, starts=2)).operate == {"T.use": 1.0}  # a contact

@@ -115,12 +115,45 @@ def test_a_successor_takes_what_it_has_by_name_and_its_own_defaults(
     loop.scan(sample())
     loop.scan(sample())
     assert loop.controller is otherwise_operated
-    assert named(loop) == {"valve.low": 0.0, "valve.high": 55.0, "p.use": 0.0, "caution": 2.0}
+    assert named(loop) == {"valve.low": 10.0, "valve.high": 55.0, "p.use": 0.0, "caution": 2.0}
     assert Given.of(otherwise_operated.manifest, loop.scan(sample()).info).operate == named(loop)
     assert swapped(loop, operated)[-1].successor_mv is not None
     assert loop.controller is operated
     assert named(loop)["valve.high"] == 55.0
-    assert named(loop)["speed"] == 1.0  # the one before has no such entry
+    assert named(loop)["speed"] == 3.0  # also what the one before has not
+
+
+def test_a_successor_has_its_own_defaults_where_nobody_set_anything(
+    operated: Controller, otherwise_operated: Controller
+) -> None:
+    loop = loop_of(operated)
+    swapped(loop, otherwise_operated)
+    assert loop.controller is otherwise_operated
+    assert named(loop) == {e.name: e.default for e in otherwise_operated.manifest.operate}
+
+
+def test_a_default_outside_the_successors_range_keeps_it_from_nothing(operated: Controller, narrow: Controller) -> None:
+    loop = loop_of(operated)
+    swapped(loop, narrow)
+    assert loop.controller is narrow
+    loop = loop_of(operated)
+    loop.set_operate({"valve.low": 0.0})  # the default, but somebody's word
+    swapped(loop, narrow)
+    assert loop.controller is operated
+    assert loop.successor is not None
+    assert "valve.low" in loop.successor.reason
+
+
+def test_what_was_set_outlasts_laws_that_lack_it(
+    operated: Controller, otherwise_operated: Controller, not_operated: Controller
+) -> None:
+    loop = loop_of(operated, operate={"speed": 3.0})
+    loop.set_operate({"valve.use": 0.0, "T.use": 0.0})
+    for law in (otherwise_operated, not_operated, operated):
+        swapped(loop, law)
+        assert loop.controller is law
+    defaults = {e.name: e.default for e in operated.manifest.operate}
+    assert named(loop) == {**defaults, "speed": 3.0, "valve.use": 0.0, "T.use": 0.0}
 
 
 def test_a_value_outside_the_successors_range_keeps_its_trial_from_counting(
@@ -156,7 +189,7 @@ def test_a_swap_between_laws_with_and_without_it(operated: Controller, not_opera
     loop.set_mode(Mode.AUTO)
     swapped(loop, operated)
     assert loop.controller is operated
-    assert named(loop)["speed"] == 1.0
+    assert named(loop)["speed"] == 2.0
     assert list(loop.scan(bad).bridged) == ["T"]
 
 

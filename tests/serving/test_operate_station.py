@@ -177,6 +177,9 @@ class Plant:
     def start(self) -> None:
         """Nothing: it is there."""
 
+    def serve(self, law: Manifest) -> None:
+        self.law = law
+
     def close(self) -> None:
         """Nothing."""
 
@@ -323,6 +326,19 @@ def test_bridged_left_out_and_read_again_stand_in_the_journal_and_the_views(
     assert [e.alarm for e in raised] == ["reading T"]
     assert made.loop is not None
     assert made.loop.mode is Mode.MANUAL
+
+
+def test_the_endpoint_is_told_which_law_it_serves(
+    operated: Controller, not_operated: Controller, make_station: Callable[..., Station]
+) -> None:
+    made = make_station(not_operated)
+
+    def swap(_: Any) -> None:
+        assert made.loop is not None
+        made.loop.swap(operated, 1)
+
+    ran(made, s1=swap)
+    assert "fresh" in made.endpoint.law.inputs  # type: ignore[attr-defined]
 
 
 # ------------------------------------------------------------------------------------------------------------- command

@@ -266,7 +266,8 @@ export class Loop {
     this.lost = false; // the last command did not reach the plant, and nothing has told since where the MV stands
     this.sp = within(sp, controller.manifest.sp, "set point");
     this.mv = this.before = mv && within(mv, controller.manifest.mv, "MV");
-    this.operate = controller.operate.default; // what operators have changed, see setOperate
+    this.operate = controller.operate.default; // see setOperate
+    this.wishes = {}; // the values that somebody has set, by name; they outlast a law that lacks them
     this.wanted = null; // where an operator sent the MV: it goes there by at most its max_move a period
   }
 
@@ -282,6 +283,7 @@ export class Loop {
   // Values of `operate` by name, {"y0.low": 40, "y0.high": 60}; Refused, and nothing changed, where one is not allowed.
   setOperate(values) {
     this.operate = this.controller.operate.withValues(values, this.operate);
+    Object.assign(this.wishes, values);
   }
 
   setMv(mv) {
@@ -292,9 +294,13 @@ export class Loop {
     else this.mv = wanted;
   }
 
-  // Another controller takes over; it has no past, and the defaults of its own `operate`.
+  // Another controller takes over; it has no past. It has by name what somebody has set of `operate`, and its own defaults for
+  // the rest; Refused, and nothing changed, where a value is outside its range.
   replace(controller) {
-    Object.assign(this, { controller, state: controller.cold(), operate: controller.operate.default });
+    const known = controller.operate.entries.map((e) => e.name);
+    const set = Object.entries(this.wishes).filter(([name]) => known.includes(name));
+    const operate = controller.operate.withValues(Object.fromEntries(set));
+    Object.assign(this, { controller, state: controller.cold(), operate });
     this.bridging = new Bridging(controller.manifest, this.bridging.bridgeS, this.bridging.critical);
   }
 
