@@ -309,6 +309,8 @@ def test_a_pv_and_an_mv_of_one_name_are_refused_at_the_design() -> None:
 def test_a_default_that_no_operator_may_set_is_refused(defaults: dict[str, float]) -> None:
     with pytest.raises(LawError, match=next(iter(defaults)).replace(".", r"\.")):
         law_of(random_model(1), horizon=20, operate=defaults)
+    with pytest.raises(LawError, match=next(iter(defaults)).replace(".", r"\.")):  # before a model is fitted
+        Predictive.check_settings(Predictive.Params(operate=defaults), made_signals(1, 1))
 
 
 # ------------------------------------------------------------------------- schemes that these numbers take the place of

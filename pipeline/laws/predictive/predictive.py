@@ -282,11 +282,16 @@ class Predictive(ControlLaw):
 
     @classmethod
     def check_settings(cls, params: Any, signals: Signals) -> None:
-        """Raise LawError for a plant with discrete MVs, or for weights, limits or rates that do not fit its signals."""
+        """Raise LawError for a plant with discrete MVs, or for settings that do not fit its signals.
+
+        These are weights, limits, rates, and the defaults of ``operate``; how many PVs the model has is not known yet.
+        """
         refuse_discrete(signals)
         super().check_settings(params, signals)
         weights_of(signals, params)
         limits_of(signals, params)
+        if params.operate is not None:
+            entries_of(signals, len(signals.pv), params.cv_low or (), params.cv_high or (), params.operate)
 
     def forward(
         self,
