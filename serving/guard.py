@@ -77,7 +77,7 @@ def lasting(fault: str) -> str:
 # -------------------------------------------------------------------------------------------------------------- guards
 Array: TypeAlias = NDArray[np.float64]
 
-READ_BACK_MARGIN = 0.02  # share of an MV's range by which scaling may carry a sound read-back over its ends
+READ_BACK_MARGIN = 0.02  # share of an MV's range by which scaling may carry a sound read-back off, also over its ends
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,7 +78,7 @@ class Operate:
         return given
 
     def ordered(self, values: ArrayLike) -> Array:
-        """``values`` (n,) with the ends of a range exchanged where the low one is above the high one."""
+        """``values`` (n,) within their ranges, both ends exchanged where the low one is above the high one."""
         found = np.array(values, dtype=np.float64)
         found[self._pairs] = np.sort(found[self._pairs], axis=-1)
-        return found
+        return np.clip(found, self._low, self._high)

@@ -270,10 +270,7 @@ def _operated(operate: Operate, rng: np.random.Generator) -> Callable[[], Array]
                     at[i] = float(rng.uniform() < SWITCHED_ON) * e.high
                 elif e.what == "rank":
                     at[i] = round(at[i])
-                elif e.what == "high" and (low := operate.places.get(f"{e.signal}.low")) is not None:
-                    at[[low, i]] = sorted(at[[low, i]])
-                    at[low] = min(at[low], operate.entries[low].high)
-                    at[i] = max(at[i], e.low)
+            at = operate.ordered(at)
         return at
 
     return step

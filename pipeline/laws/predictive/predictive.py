@@ -32,12 +32,12 @@ from loopwright.pipeline.models.memory import AffineMap, Named
 from loopwright.pipeline.plants.noise import level_gain
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.tuning.calm_choice import calmest
+from loopwright.serving.guard import READ_BACK_MARGIN
 
 # Of the searched numbers, for a plant on which they do not hold:
 CALM_SPEED = 0.3  # moves weigh eleven times as much
 CALM_JUMPS = 0.1  # the observer takes a swing of its own loop for steps of a load less
 UNBOUNDED = 1e6  # scaled: no set point comes near
-SAME_PLACE = 0.02  # share of an MV's range by which scaling may carry a sound read-back off its command
 
 
 class Predictive(ControlLaw):
@@ -157,7 +157,7 @@ class Predictive(ControlLaw):
         self.operate = entries_of(self.signals, n_o, low, high, params.operate or {})
         scales = OperateScales(model.y_center[:n_o], model.y_scale[:n_o], middle, half)
         self.operation = Operation(self.operate, scales, self.moves, most_weight)
-        self.register_buffer("same", 2 * SAME_PLACE * half)
+        self.register_buffer("same", 2 * READ_BACK_MARGIN * half)
         default = torch.tensor([entry.default for entry in self.operate], dtype=torch.float64)
         self.register_buffer("operate_default", default)
         rows, columns = torch.triu_indices(self.observer.n_a, self.observer.n_a)
