@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -240,13 +240,26 @@ class Successor:
 Guards: TypeAlias = Sequence[Guard] | Callable[[Manifest], Sequence[Guard]]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LawInputs:
+    """Inputs that a law was last stepped with: the same step can be computed again from them, and looked into.
+
+    ``values`` are by the inputs' names, of the loop's signals; ``unread_s`` (n_pv,) is the time since each PV was read
+    well, 0 where it was for this step.
+    """
+
+    values: Mapping[str, Array]
+    unread_s: Array
+
+
 class ActiveController:
     """The controller in charge with the state of its law, its guards and the samples that they look back to.
 
     ``guards`` are a host's own, or what makes them for a controller's manifest: they are then made anew for each
     controller that takes over. ``bridge_s`` and ``critical`` are of ``Bridging``. ``wishes`` are the values of
     ``operate`` that somebody has set since the loop began, by name: they outlast a law that lacks them. ``operate``
-    (n_operate,) is those that the law in charge has, and its own defaults for the rest.
+    (n_operate,) is those that the law in charge has, and its own defaults for the rest. ``stepped`` has the inputs of
+    its last step.
     """
 
     def __init__(
@@ -262,6 +275,7 @@ class ActiveController:
         self.guards: tuple[Guard, ...] = tuple(guards(controller.manifest) if callable(guards) else guards)
         self._bridging = Bridging(controller.manifest, bridge_s, critical)
         self._state = controller.cold_state()
+        self.stepped: LawInputs | None = None
         self._past = deque[Sample](maxlen=_longest(self.guards))
         self._before: tuple[Sample, ...] = ()  # the past of the present sample, for the successor
 
@@ -282,7 +296,9 @@ class ActiveController:
         try:
             return self.operating.with_values(values, self.operate)
         except ContractError as error:
-            raise LoopError(first_line(error)) from error
+            refused = LoopError(first_line(error))
+            refused.entry = error.entry
+            raise refused from error
 
     def set_operate(self, values: Mapping[str, float]) -> None:
         """Change some of ``operate``; LoopError as ``operate_with``, and nothing is changed then."""
@@ -294,7 +310,11 @@ class ActiveController:
         sample = readings.sample
         self._before = tuple(self._past) if self.successor is not None else ()
         more = _inputs(self.controller, readings, self._bridging.used(self.operate, readings))
-        step = self.controller.step(sp=sp, dv=sample.dv, mv_applied=applied, state=self._state, **more)
+        given = {"sp": sp, "dv": sample.dv, "mv_applied": applied, "state": self._state, **more}
+        step = self.controller.step(**given)
+        read = self.controller.manifest.inputs  # another one may hold anything
+        values = {n: np.array(given[n], dtype=np.float64) for n in read if n in given}  # hosts reuse their arrays
+        self.stepped = LawInputs(values, self._bridging.unread_s)
         if self._past.maxlen:
             self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
         self._state = step.state
@@ -308,7 +328,7 @@ class ActiveController:
         new.step(sample, sp, applied, self._before, self.wishes)
         if new.ready:
             self.replaced, self.successor = self.controller, None
-            self.controller, self._state = new.controller, new.state
+            self.controller, self._state, self.stepped = new.controller, new.state, None
             self.operating, self.operate, self._bridging = new.operating, new.operate, new.bridging
             if self._made is not None:
                 self.guards = tuple(new.guards)

@@ -90,6 +90,11 @@ class Bridging:
         made._excused, made._why = self._excused.copy(), dict(self._why)
         return made
 
+    @property
+    def unread_s(self) -> Array:
+        """Time since each PV (n_pv,) was read well [s]; 0 for all of a law that takes a whole sample or none."""
+        return self._gone * self.manifest.period_s if self._apart else np.zeros(len(self._gone))
+
     def missed(self, periods: int = 1) -> None:
         """Periods without a sample."""
         self._gone += periods

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.active_controller import ActiveController, Guards, Successor
+from loopwright.serving.active_controller import ActiveController, Guards, LawInputs, Successor
 from loopwright.serving.clock import Clock, MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.endpoint import Endpoint, HandsBack
@@ -161,6 +161,11 @@ class ControlLoop:
     def guards(self) -> tuple[Guard, ...]:
         """The guards of the controller in charge."""
         return self._active.guards
+
+    @property
+    def stepped(self) -> LawInputs | None:
+        """Inputs of the law's last step; None before the first one of the controller in charge."""
+        return self._active.stepped
 
     def swap(self, controller: Controller, trial: int) -> None:
         """Try ``controller`` for ``trial`` good scans in a row beside the one in charge, then give it the plant.

@@ -33,13 +33,13 @@ class Operate:
         found = np.array(self.default if base is None else base, dtype=np.float64)
         for name, value in values.items():
             if name not in self.places:
-                raise ContractError(f"operate has no entry {shown(name)}{nearest(name, self.places)}")
+                raise _wrong(str(name), f"operate has no entry {shown(name)}{nearest(name, self.places)}")
             try:
                 number = numbers(value)
             except TypeError as error:
-                raise ContractError(f"operate: {name} {error}; it needs a number") from error
+                raise _wrong(name, f"operate: {name} {error}; it needs a number") from error
             if number.shape:
-                raise ContractError(f"operate: {name} has the shape {number.shape}; it needs one number")
+                raise _wrong(name, f"operate: {name} has the shape {number.shape}; it needs one number")
             found[self.places[name]] = number
         return self.checked(found)
 
@@ -67,13 +67,14 @@ class Operate:
             e = self.entries[i]
             switched = self._switches[i] and e.low < e.high
             allowed = "0 or 1" if switched else f"{e.low:g} to {e.high:g} {e.unit}".rstrip()
-            raise ContractError(f"operate: {e.name} is {given[i]:g}; allowed is {allowed}")
+            raise _wrong(e.name, f"operate: {e.name} is {given[i]:g}; allowed is {allowed}")
         crossed = given[self._pairs[:, 0]] > given[self._pairs[:, 1]]
         if crossed.any():
             low, high = (int(k) for k in self._pairs[int(np.argmax(crossed))])
-            raise ContractError(
+            raise _wrong(
+                self.entries[low].name,
                 f"operate: {self.entries[low].name} is {given[low]:g}, above {self.entries[high].name} = "
-                f"{given[high]:g}; a low end must not be above the high one"
+                f"{given[high]:g}; a low end must not be above the high one",
             )
         return given
 
@@ -82,3 +83,10 @@ class Operate:
         found = np.array(values, dtype=np.float64)
         found[self._pairs] = np.sort(found[self._pairs], axis=-1)
         return np.clip(found, self._low, self._high)
+
+
+def _wrong(entry: str, words: str) -> ContractError:
+    """The error that ``words`` say of an entry."""
+    error = ContractError(words)
+    error.entry = entry
+    return error

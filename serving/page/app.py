@@ -279,7 +279,7 @@ class PageApp:
             raise HTTPException(408, "the change did not arrive in time") from None
         except (ValueError, RecursionError):
             raise HTTPException(400, "the change is no JSON") from None
-        if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "picture"}:
+        if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "inputs", "picture"}:
             raise HTTPException(400, 'a change is an object with "do"')
         if wanted.get("do") == "swap" and not _is_name(wanted.get("value")):
             raise HTTPException(400, "the page tries only files that lie beside the controller in charge, by name")

@@ -136,7 +136,7 @@ def change(request: Request, loop: ControlLoop, opened: Opened) -> Change:
     does = {"mode": _mode, "sp": _sp, "mv": _mv, "operate": _operate, "swap": _swap, "keep": _keep, "back": _back}
     made = does.get(request.do)
     if made is None:
-        known = (*does, "acknowledge", "state", "about")
+        known = (*does, "acknowledge", "state", "about", "inputs")
         raise LoopError(f"the loop cannot {request.do!r}{nearest(request.do, known)}")
     return made(request, loop, opened)
 

@@ -44,7 +44,7 @@ from loopwright.serving.station.plant_side import PlantSide, shown_values
 from loopwright.serving.station.recorder import MonitorRunner, Recorder
 from loopwright.serving.station.requests import Change, Request, change
 from loopwright.serving.station.settings import Settings
-from loopwright.serving.station.views import Snapshot, about, picture, state
+from loopwright.serving.station.views import VIEWS, Snapshot
 from loopwright.serving.trust import Controller as TrustedController
 from loopwright.serving.trust import ending, judged, signer
 from loopwright.serving.words import first_line
@@ -267,7 +267,7 @@ class Station:
             self.watching.seen(stepped, seen)
         finally:  # a scan that cannot be written down is a scan
             counts = self._missed_periods, self._faults
-            self.snapshot = Snapshot.of(self.loop, self.watching.monitor, seen, stepped, counts)
+            self.snapshot = Snapshot.of(self.loop, self.watching.monitor, seen, stepped, counts, self.snapshot)
         for show in self._watchers:
             show(sample, command)
 
@@ -296,8 +296,8 @@ class Station:
 
     def answer(self, tree: Any) -> Answer:
         """The answer to a request, from any thread: a view, or the change once a scan has carried it out."""
-        if isinstance(tree, dict) and tree.get("do") in {"state", "about", "picture"}:
-            return self._view(str(tree["do"]))
+        if isinstance(tree, dict) and isinstance(tree.get("do"), str) and tree["do"] in VIEWS:
+            return VIEWS[tree["do"]](self)
         request = Request.read(tree)
         if self.settings.accept_unproven:
             request = replace(request, accept_unproven=True)
@@ -316,12 +316,6 @@ class Station:
         if refused:
             raise LoopError(refused)
         return {"done": wanted.what}
-
-    def _view(self, name: str) -> Answer:
-        if name == "picture":
-            path = picture(self.active_controller)
-            return {"file": None if path is None else str(path.absolute())}
-        return about(self) if name == "about" else state(self)
 
     def _acknowledge(self, request: Request) -> Answer:
         """Write down who has seen an alarm."""

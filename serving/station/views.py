@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from loopwright.serving.active_controller import LawInputs
+from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample
 from loopwright.serving.journal import columns
 from loopwright.serving.loop import Command, ControlLoop
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
 View = dict[str, Any]
 
 SILENT_PERIODS = 3  # without a scan: the loop counts as dead
+MOST_OPERATED = 300  # changes of operate that the trends draw as ranges: a shift has some ten
 PICTURES = ("{stem}.png", "figures/closed_loop_{stem}.png")
 
 
@@ -45,6 +49,9 @@ class Snapshot:
     missed: int  # periods
     faults: int  # scans
     operate: tuple[float, ...]  # as operators want it of the controller in charge
+    operated: tuple[tuple[float, tuple[float, ...]], ...]  # since when these and earlier values of it hold
+    inputs: LawInputs | None  # of the last step of the controller in charge
+    stepped_s: float  # since 1970, when that was
     verdicts: tuple[Verdict, ...]
     numbers: Mapping[str, float]
 
@@ -56,8 +63,12 @@ class Snapshot:
         seen: tuple[Sample | None, Command, float],
         stepped: Controller,
         counts: tuple[int, int],
+        before: Snapshot | None = None,
     ) -> Self:
-        """After a scan ``seen``, by the controller ``stepped``; ``counts``: periods missed, scans with a fault."""
+        """After a scan ``seen``, by the controller ``stepped``; ``counts``: periods missed, scans with a fault.
+
+        ``before`` is the snapshot of the scan before it.
+        """
         sample, command, seen_s = seen
         new = loop.successor
         successor = None
@@ -65,7 +76,12 @@ class Snapshot:
             successor = {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
         told = tuple(monitor.verdicts()), monitor.numbers()
         operate = tuple(map(float, loop.operate))
-        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, operate, *told)
+        operated = () if before is None or before.controller is not loop.controller else before.operated
+        if not operated or operated[-1][1] != operate:
+            operated = (*operated[1 - MOST_OPERATED :], (seen_s, operate))
+        stepped_s = seen_s if command.law_mv is not None or before is None else before.stepped_s
+        past = (operate, operated, loop.stepped, stepped_s)
+        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, *past, *told)
 
 
 def about(station: Station) -> View:
@@ -80,6 +96,8 @@ def about(station: Station) -> View:
         "signals": {name: [s.to_dict() for s in signals] for name, signals in groups.items()},
         "info": list(m.info),
         "operate": [{"name": e.name, **e.to_dict()} for e in m.operate],
+        "operated": [] if station.snapshot is None else [[at, list(of)] for at, of in station.snapshot.operated],
+        "bridge_s": BRIDGE_PERIODS * m.period_s if (of := station.settings.fresh.bridge_s) is None else of,
         "columns": columns(m),
         "card": _card(controller),
         "folder": str(controller.path.absolute().parent),
@@ -125,6 +143,7 @@ def state(station: Station) -> View:
         "operate": list(seen.operate),  # of the names in ``about``
         "bridged": dict(command.bridged),
         "shed": dict(command.shed),
+        "unread_s": None if seen.inputs is None else _plain(seen.inputs.unread_s),
         "quality": [] if sample is None else [words(status) for status in sample.quality],
         "sha256": seen.controller.sha256,
         "successor": seen.successor,
@@ -138,6 +157,24 @@ def state(station: Station) -> View:
         "verdicts": [asdict(v) for v in seen.verdicts],
         "numbers": dict(seen.numbers),
         "warnings": station.ending(),
+    }
+
+
+def inputs(station: Station) -> View:
+    """Inputs of the last step of the controller in charge, and its file: for who computes that step again.
+
+    LoopError before the first one.
+    """
+    seen = station.snapshot
+    if seen is None or seen.inputs is None:
+        raise LoopError("the law in charge has not been stepped yet: nothing is known of its next moves")
+    m = station.manifest
+    return {
+        "time": seen.stepped_s,
+        "file": str(seen.controller.path.absolute()),
+        "sha256": seen.controller.sha256,
+        "signals": {name: [s.name for s in m.signals(name)] for name in ("pv", "dv")},
+        "inputs": {name: value.tolist() for name, value in seen.inputs.values.items()},
     }
 
 
@@ -182,3 +219,16 @@ def picture(controller: Controller) -> Path | None:
         if path.is_file():
             return path
     return None
+
+
+def _pictured(station: Station) -> View:
+    path = picture(station.active_controller)
+    return {"file": None if path is None else str(path.absolute())}
+
+
+VIEWS: Mapping[str, Callable[[Station], View]] = {
+    "about": about,
+    "state": state,
+    "inputs": inputs,
+    "picture": _pictured,
+}

@@ -13,7 +13,7 @@ export async function get(path) {
 export class Refused extends Error {
   constructor(message, status, found = {}) {
     super(message);
-    Object.assign(this, { status, needs: found.needs, unproven: found.unproven });
+    Object.assign(this, { status, needs: found.needs, unproven: found.unproven, entry: found.entry });
   }
 }
 

@@ -31,7 +31,7 @@ function field({ name, label, value, min, max, choices, step }) {
     ? element("select", { "data-field": name }, ...choices.map(([c, words]) => element("option", { value: c, selected: c === value }, words)))
     : element("input", { "data-field": name, type: "number", step: step || "any", required: true, min, max, value });
   given.dataset.first = given.value;
-  return element("label", {}, label + " ", given);
+  return element("label", {}, label + " ", given, element("span", { class: "wrong", id: `wrong-${name}` }));
 }
 
 // A controller that is not proven gets into AUTO by a second word only, which is written down.
@@ -68,6 +68,7 @@ async function confirm(event) {
   const [who, reason, token] = ["who", "why", "token"].map((id) => $(id).value.trim());
   sessionStorage.setItem("who", who);
   $("refusal").textContent = "";
+  wrong(null);
   $("confirm").disabled = true;
   let said, refused;
   try {
@@ -85,12 +86,31 @@ async function confirm(event) {
     accepts(unproven);
     $("refusal").textContent = unproven
       ? `Not done: not proven in closed loop. ${refused.unproven}. Accept it, and it moves the plant in AUTO all the same; that is written down.`
-      : said;
+      : wrong(refused.entry, refused.message)
+        ? `Not done: see ${refused.entry}.`
+        : said;
     if (refused.status === UNAUTHORIZED) $("token").select();
     return;
   }
   $("answer").textContent = said; // the dialog may have been left meanwhile; the answer is still told
   if (open) $("dialog").close();
+}
+
+// The loop's own words beside the entry that it refused; false where no field is of that name.
+function wrong(name, words) {
+  let shown = false;
+  for (const input of inputs()) {
+    const mine = name && input.dataset.field === name;
+    const line = input.parentElement.querySelector(".wrong");
+    line.textContent = mine ? words : "";
+    for (const [attribute, value] of [["aria-invalid", "true"], ["aria-describedby", line.id]]) {
+      if (mine) input.setAttribute(attribute, value);
+      else input.removeAttribute(attribute);
+    }
+    if (mine) input.focus();
+    shown ||= Boolean(mine);
+  }
+  return shown;
 }
 
 // The button that opened the dialog may be gone: then a keyboard goes on in its section, not at the page's top.
