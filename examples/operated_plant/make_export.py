@@ -20,21 +20,21 @@ import numpy as np
 
 PERIOD_S, HOURS, DEAD_S, PARTS = 10.0, 24, 20.0, 10
 START = datetime(2024, 3, 4, 6, 0, 0, tzinfo=UTC)
-HEADER = ["Timestamp", "TIC-1.PV", "LIC-2.PV", "FV-1", "FV-2", "FV-3"]
+HEADER = ["Timestamp", "TIC-1", "LIC-2", "FV-1", "FV-2", "FV-3"]
 UNITS = ["", "degC", "%", "%", "%", "%"]
-AREA, HEIGHT = 0.8, 2.0  # [m2], [m] at a level of 100 %
-MOST_HOT, MOST_COLD, OUT = 0.009, 0.009, 0.014  # [m3/s], [m3/s], [m2.5/s]
+AREA, HEIGHT = 0.4, 2.0  # [m2], [m] at a level of 100 %
+MOST_HOT, MOST_COLD, OUT = 0.009, 0.009, 0.0135  # [m3/s], [m3/s], [m2.5/s]
 T_HOT, T_COLD, T_ROOM, LOSS = 80.0, 12.0, 18.0, 2e-4  # [degC], [m3/s]
-VALVES = ((15.0, 75.0), (15.0, 75.0), (40.0, 90.0))  # hot, cold, outlet: where the operator moves them [%]
+VALVES = ((30.0, 60.0), (30.0, 60.0), (55.0, 80.0))  # hot, cold, outlet: where the operator moves them [%]
 
 
 def moved(random: np.random.Generator, n: int) -> np.ndarray:
-    """The valves' positions (n, 3) [%]: each is held for two to fifteen minutes at a time."""
+    """The valves' positions (n, 3) [%]: each is held for seven to twenty minutes at a time."""
     valves = np.empty((n, 3))
     for j, (low, high) in enumerate(VALVES):
         k = 0
         while k < n:
-            hold = int(random.integers(12, 90))
+            hold = int(random.integers(40, 120))
             valves[k : k + hold, j], k = np.round(random.uniform(low, high), 1), k + hold
     return valves
 
@@ -46,7 +46,7 @@ def simulated(random: np.random.Generator, valves: np.ndarray) -> tuple[np.ndarr
     t, h, hot = 40.0, 0.9, T_HOT
     for k in range(n):
         temperature[k], level[k] = t, 100 * h / HEIGHT
-        hot += 0.01 * (T_HOT - hot) + random.normal(0, 0.15)
+        hot += 0.01 * (T_HOT - hot) + random.normal(0, 0.1)
         feed, out = valves[max(k - dead, 0), :2] / 100, valves[k, 2] / 100
         for _ in range(PARTS):
             q_hot, q_cold = MOST_HOT * feed[0], MOST_COLD * feed[1]

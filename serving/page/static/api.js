@@ -35,6 +35,19 @@ export async function change(wanted, token) {
   return found.done;
 }
 
+// What the law would do after changes by name; it changes nothing, so it needs no token.
+export async function foresee(changes) {
+  const answer = await fetch("/api/what-if", {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ changes }),
+    signal: AbortSignal.timeout(PATIENCE_MS),
+  });
+  const found = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new Refused(found.error || answer.statusText, answer.status, found);
+  return found;
+}
+
 // Server-sent events. The browser connects again by itself, but not after an answer that is no stream (a proxy's 502).
 export function listen(handlers, lost, found) {
   const stream = new EventSource("/api/live");

@@ -85,7 +85,13 @@ function values() {
   if (whole) operate.fill(whole, "law", null, state, 0);
 }
 
-const lawBlock = (part) => element("div", { class: "signal", role: "group", "aria-label": "The whole law" }, element("h3", {}, "The whole law"), part);
+const lawBlock = (part) => element("div", { class: "signal", role: "group", "aria-label": "The whole law" }, headed("The whole law", "law", null), part);
+
+// The name of a block, and the button that changes what operators may change of it.
+function headed(name, group, signal) {
+  const button = element("button", { type: "button", "data-change": signal ? name : "law", "aria-label": `Change ${name}…`, onclick: () => operate.askChange(group, signal) }, "Change…");
+  return element("div", { class: "headed" }, element("h3", {}, name), button);
+}
 
 // The part of the bar that operators allow.
 function within(box, signal, ends) {
@@ -117,7 +123,7 @@ function block(group, signal, cells) {
       element("span", { class: "quality" }),
     ),
   );
-  return element("div", { class: "signal", role: "group", "aria-label": signal.name }, element("h3", {}, signal.name), element("div", { class: "cells" }, ...made), bar, operated);
+  return element("div", { class: "signal", role: "group", "aria-label": signal.name }, operated ? headed(signal.name, group, signal) : element("h3", {}, signal.name), element("div", { class: "cells" }, ...made), bar, operated);
 }
 
 function fill(block, signal, cells, [value, mark]) {
@@ -132,6 +138,11 @@ function fill(block, signal, cells, [value, mark]) {
   const line = block.querySelector(".mark");
   line.hidden = mark === null;
   if (mark !== null) line.style.left = `${share(mark, signal)}%`;
+}
+
+// News of what the law predicts, between two states.
+export function foreseen() {
+  if (about && state?.pv !== undefined) values();
 }
 
 function askMode(mode) {
@@ -160,6 +171,7 @@ function askValues(title, words, signals, present, what) {
       max: s.high,
       choices: s.values && s.values.map((v) => [v, choice(v, s)]),
     })),
+    foresee: what === "sp" ? operate.foresee : null,
     request: (values) => ({ do: what, value: values }),
   });
 }

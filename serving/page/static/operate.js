@@ -1,5 +1,6 @@
 // What operators change of a law that reads `operate`: ranges, limits, uses, ranks, resting values, costs; signal by signal.
 import { ask } from "./dialog.js";
+import * as foresight from "./foresight.js";
 import { duration, element, figure, number, say, unit } from "./format.js";
 
 const NEAR = 1e-6; // of a signal's range: nearer to a limit is at it
@@ -8,11 +9,13 @@ let law = ""; // of which these are
 let entries = new Map(); // name -> { entry, i }
 let bridge_s = 0;
 let given = null; // the state that is shown
+let signals = []; // those of which something is foreseen
 
 // about: what the loop is.
 export function describe(about) {
   entries = new Map((about.operate || []).map((entry, i) => [entry.name, { entry, i }]));
   [law, bridge_s] = [about.title, about.bridge_s || 0];
+  signals = [...about.signals.mv, ...about.signals.pv];
 }
 
 export const steers = () => entries.size > 0;
@@ -29,27 +32,26 @@ export function range(signal) {
 
 // ------------------------------------------------------------------------------------------------------ what is shown
 const FACTS = {
-  pv: [["range", "Range"], ["track", "Set point"], ["rank", "Priority"], ["cost", "Cost"], ["reading", "Reading"]],
-  mv: [["range", "Limits"], ["max_move", "Largest move"], ["rest", "Resting value"], ["cost", "Cost"]],
-  law: [["speed", "Speed"], ["caution", "Caution"]],
+  pv: [["range", "Range"], ["track", "Set point"], ["rank", "Priority"], ["cost", "Cost"], ["reading", "Reading"], ["expected", "Expected"]],
+  mv: [["range", "Limits"], ["max_move", "Largest move"], ["rest", "Resting value"], ["cost", "Cost"], ["why", "Why"]],
+  law: [["speed", "Speed"], ["caution", "Caution"], ["missing", "Why"]],
 };
+const LATER = ["reading", "expected", "why", "missing"]; // no entries, but news of the law; hidden while there are none
 const PARTS = { range: "low", rest: "rest_use" }; // entries that a fact is made of, where its name is another one
-const has = (signal, what) => what === "reading" || of(signal, PARTS[what] || what) !== undefined;
+const has = (signal, what) => LATER.includes(what) || of(signal, PARTS[what] || what) !== undefined;
 
 // The part of a signal's block that belongs to operators; null where the law has none of it.
 export function part(group, signal, state) {
   given = state;
   if (!steers() || (group !== "pv" && group !== "mv" && group !== "law")) return null;
   const facts = FACTS[group].filter(([what]) => has(signal, what));
-  if (!facts.some(([what]) => what !== "reading") && of(signal, "use") === undefined) return null;
-  const name = signal ? signal.name : "the whole law";
+  if (!facts.some(([what]) => !LATER.includes(what)) && of(signal, "use") === undefined) return null;
   const rows = facts.flatMap(([what, words]) => [element("dt", {}, words), element("dd", { "data-fact": what })]);
   return element(
     "div",
     { class: "operated", "data-operated": signal ? signal.name : "law" },
     element("p", { class: "stands", hidden: true }),
     element("dl", {}, ...rows),
-    element("button", { type: "button", "data-change": signal ? signal.name : "law", "aria-label": `Change ${name}…`, onclick: () => askChange(group, signal) }, "Change…"),
   );
 }
 
@@ -63,7 +65,9 @@ export function fill(part, group, signal, state, i) {
   say(line, stands ? `${{ alarm: "▲ ", watch: "◆ " }[stands.level] || ""}${stands.words}` : "");
   for (const cell of part.querySelectorAll("[data-fact]")) {
     const what = cell.dataset.fact;
-    say(cell, fact(what, signal, i));
+    const words = fact(what, signal, i);
+    cell.hidden = cell.previousSibling.hidden = LATER.includes(what) && !words;
+    say(cell, words);
     cell.classList.toggle("moved", moved(signal, what));
   }
 }
@@ -87,6 +91,12 @@ function fact(what, signal, i) {
       return of(signal, "rest_use") ? shown(of(signal, "rest")) : "none";
     case "reading":
       return reading(i);
+    case "expected":
+      return foresight.expected(signal);
+    case "why":
+      return foresight.reasons(signal);
+    case "missing":
+      return foresight.why() && `not known: ${foresight.why()}`;
     default:
       return `× ${figure(of(null, what))}`;
   }
@@ -100,7 +110,8 @@ function reading(i) {
 
 // Whether operators, or a file of settings, made it another one than the law's own.
 function moved(signal, what) {
-  const names = { range: ["low", "high"], rest: ["rest_use"], reading: [] }[what] || [what];
+  if (LATER.includes(what)) return false;
+  const names = { range: ["low", "high"], rest: ["rest_use"] }[what] || [what];
   return names.some((n) => {
     const { entry } = entries.get(signal ? `${signal.name}.${n}` : n);
     return value(entry.name) !== entry.default;
@@ -150,7 +161,7 @@ const FIELDS = {
     ["track", "Set point", [[1, "followed"], [0, "left alone within its range"]]],
     ["low", "Range, low end"],
     ["high", "Range, high end"],
-    ["rank", "Priority of its range: 1 is kept first"],
+    ["rank", "Priority of its range (1 is kept first)"],
     ["cost", "Cost"],
   ],
   mv: [
@@ -166,17 +177,18 @@ const FIELDS = {
 };
 
 // No `min` and `max`: the loop itself says what is wrong, in one line, beside the entry.
-function askChange(group, signal) {
+export function askChange(group, signal) {
   const fields = FIELDS[group]
-    .map(([what, label, choices]) => ({ found: entries.get(signal ? `${signal.name}.${what}` : what), label, choices }))
+    .map(([what, label, choices]) => ({ what, found: entries.get(signal ? `${signal.name}.${what}` : what), label, choices }))
     .filter(({ found, choices }) => found && !(choices && found.entry.low === found.entry.high))
-    .map(({ found: { entry }, label, choices }) => {
+    .map(({ what, found: { entry }, label, choices }) => {
       const now = value(entry.name);
       const written = (v) => (["low", "high", "rest"].includes(entry.what) ? number(v, signal) : figure(v));
-      const allowed = `${[entry.unit && `[${entry.unit}]`, `${figure(entry.low)} … ${figure(entry.high)}`].filter(Boolean).join(", ")}`;
+      const ends = what === "cost" ? "" : `${figure(entry.low)} … ${figure(entry.high)}`; // of a cost only ratios count
+      const allowed = [entry.unit && `[${entry.unit}]`, ends].filter(Boolean).join(", ");
       return {
         name: entry.name,
-        label: choices ? label : `${label} ${allowed}`,
+        label: choices ? label : `${label}, ${allowed}`,
         unit: choices ? "" : entry.unit,
         now: choices ? choices.find(([v]) => v === now)?.[1] : written(now),
         value: choices ? now : Number(written(now)),
@@ -187,6 +199,10 @@ function askChange(group, signal) {
     title: `Change ${signal ? signal.name : law}`,
     words: "It counts from the next scan on. The law asks for no more than the new values do.",
     fields,
+    foresee,
     request: (values) => ({ do: "operate", value: values }),
   });
 }
+
+// What the signals would do after a change, where the law can be asked for it.
+export const foresee = (changes) => (foresight.foresees() ? foresight.whatIf(changes, signals) : null);
