@@ -1,4 +1,4 @@
-"""Faceplates of a law that operators steer, in a real browser: ranges, uses, refusals, a lost sensor, keyboard, phone."""
+"""Faceplates of a law that operators steer, in a real browser: ranges, refusals, a lost sensor, keyboard, phone."""
 
 from __future__ import annotations
 
@@ -147,7 +147,6 @@ def test_a_limit_that_binds_is_marked_and_one_that_does_not_is_not(page: Page, s
     stands = page.locator('[data-operated="u0"] .stands')
     expect(stands).to_be_hidden()
     loop.does("operate", {"u0.high": 0.95})  # narrower than the engineered end, and not reached
-    assert within(20, lambda: len({c.mv[0] for c in loop.commands[-5:]}) == 1 or loop.commands[-1].mv[0] < 0.9)
     expect(stands).to_be_hidden()
     loop.does("operate", {"u0.high": max(-0.99, float(loop.commands[-1].mv[0]) - 0.05)})
     expect(stands).to_have_attribute("data-level", "watch")
