@@ -98,7 +98,7 @@ class Controller:
             data = read_controller(self.path, sha256)
             self.summary = audit(data)
             self.manifest = _manifest(self.summary.metadata)
-            self._session = _session(data)
+            self._session = session_of(data)
             _agree(self.manifest, self._session)
         except ArtifactError as error:
             raise ArtifactError(f"{self.path}: {error}") from error.__cause__
@@ -344,7 +344,7 @@ def _manifest(metadata: dict[str, str]) -> Manifest:
     return Manifest.from_json(metadata[MANIFEST_KEY])
 
 
-def _session(data: bytes) -> Any:
+def session_of(data: bytes) -> Any:
     """An onnxruntime session for one small graph in a control loop: one thread that never spins."""
     import onnxruntime as ort  # here, so that `import serving` costs nothing
 

@@ -73,7 +73,7 @@ def export(
     _check_shapes(law)
     written, inputs = law_graph(law)
     model = fused(written)
-    check_operators(law, model)
+    check_operators(law.name, model)
     manifest = Manifest(
         **{name: getattr(law.signals, name) for name in ("period_s", "sp", "pv", "dv", "mv")},
         case=case,

@@ -116,7 +116,7 @@ class Operation(nn.Module):
         self, entries: Sequence[OperateEntry], scales: OperateScales, moves: Moves, most_weight: float
     ) -> None:
         super().__init__()
-        self.horizon, self.n_moves = moves.horizon, len(moves.starts)
+        self.horizon, self.n_moves, self.scales = moves.horizon, len(moves.starts), scales
         hold_numbers(self, slope=COST_SLOPE, margin=MARGIN_SDS)
         groups: tuple[Group, ...] = ("cv", "mv")
         whats = [list(dict.fromkeys(e.what for e in entries if e.group == g)) for g in groups]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -23,7 +23,7 @@ from loopwright.pipeline.laws.predictive.params import (
     refuse_discrete,
     weights_of,
 )
-from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Cost, Planner, SetPointCourse, SoftLimits
+from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Cost, OperatedPlan, Planner, SetPointCourse, SoftLimits
 from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, in_words, tuned
 from loopwright.pipeline.laws.predictive.tuning_loops import TuningLoops
 from loopwright.pipeline.models.base import Model
@@ -38,6 +38,24 @@ from loopwright.serving.guard import READ_BACK_MARGIN
 CALM_SPEED = 0.3  # moves weigh eleven times as much
 CALM_JUMPS = 0.1  # the observer takes a swing of its own loop for steps of a load less
 UNBOUNDED = 1e6  # scaled: no set point comes near
+
+
+class PlanProblem(NamedTuple):
+    """A step's problem, scaled, as the planner takes it, and all that its answer needs beside the plan."""
+
+    mean: Tensor  # (..., 1, n_x + n_d) [x, d]
+    start: Tensor  # (..., 1, n_x + n_d + n_dv) [x, d, dv]
+    wanted: Tensor  # (..., 1, N n_o) set points
+    applied: Tensor  # (..., 1, n_mv) where the MVs go on from
+    plan: Tensor  # (..., 1, m) to begin at
+    operated: OperatedPlan | None
+    now: Named  # the inputs
+    kept: Named  # the state
+    fresh: Tensor | None  # (..., 1, n_y)
+    boost: Tensor  # (..., 1, n_y)
+    next_kept: Named  # what goes to the next state, in its order, the plan and the MVs apart
+    stands: Tensor  # (..., n_mv) [mv] as ``applied``
+    mv_applied: Tensor  # (..., n_mv) [mv]
 
 
 class Predictive(ControlLaw):
@@ -304,6 +322,21 @@ class Predictive(ControlLaw):
         fresh: Tensor | None = None,
     ) -> Stepped:
         """One step; shapes as in ControlLaw. ``operate`` (..., n_operate), ``fresh`` (..., n_pv); None: by default."""
+        problem = self.problem(sp, pv, dv, mv_applied, state, operate, fresh)
+        plan, ahead = self.planner(problem.start, problem.wanted, problem.applied, problem.plan, problem.operated)
+        return self.answer(problem, plan, ahead)
+
+    def problem(
+        self,
+        sp: Tensor,
+        pv: Tensor,
+        dv: Tensor,
+        mv_applied: Tensor,
+        state: Tensor,
+        operate: Tensor | None = None,
+        fresh: Tensor | None = None,
+    ) -> PlanProblem:
+        """The problem of a step that the planner solves; arguments as of ``forward``."""
         now = self.inputs(torch.cat([sp, pv, dv, mv_applied], dim=-1).unsqueeze(-2))
         parts = torch.split(state.unsqueeze(-2), list(self.kept.values()), dim=-1)
         kept = dict(zip(self.kept, parts, strict=True))
@@ -323,27 +356,39 @@ class Predictive(ControlLaw):
         else:
             mean, boost, estimate, plan = self._estimated(now, kept)
         measured = now["v"][..., now["z"].shape[-1] :]
-        n_cv = sp.shape[-1]
         levels = [self._level(measured, kept)] if "level" in kept else []
         start = torch.cat([mean, *(levels or [measured])], dim=-1)
         past = [torch.where(kept["started"] > 0, kept[n], now["sp"]) for n in ("sp", "sp_before") if n in kept]
         wanted = self.wanted(self._of_outputs(now["sp"]), [self._of_outputs(p) for p in past])
-        plan, ahead = self.planner(start, wanted, applied, plan, operated)
+        next_kept = {"one": now["one"], "estimate": estimate, "measured": measured}
+        if levels:
+            next_kept["level"] = levels[0]
+        if past:
+            next_kept |= {"sp": now["sp"], "sp_before": past[0]}
+        return PlanProblem(
+            mean, start, wanted, applied, plan, operated, now, kept, seen, boost, next_kept, stands, mv_applied
+        )
+
+    def answer(self, problem: PlanProblem, plan: Tensor, ahead: Tensor) -> Stepped:
+        """MV, next state and info of a step whose problem has this ``plan`` (..., 1, m); ``ahead`` (..., 1, n_o)."""
+        now, stands = problem.now, problem.stands
+        n_cv, mean = len(self.signals.sp), problem.mean
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)
-        if operated is not None:
+        if problem.operated is not None:
             # The plan is within them already; in engineering units it is so up to rounding.
-            low, high, most = (of.squeeze(-2) for of in (operated.mv_low, operated.mv_high, operated.mv_move))
+            by = problem.operated
+            low, high, most = (of.squeeze(-2) for of in (by.mv_low, by.mv_high, by.mv_move))
             mv = torch.minimum(torch.maximum(mv, low), high)
             mv = torch.minimum(torch.maximum(mv, stands - most), stands + most)
-        mv = self.limited(mv, mv_applied)
+        mv = self.limited(mv, problem.mv_applied)
         info = [
             self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],
             self.y_center + self.y_scale * ahead[..., :n_cv],
-            boost[..., :n_cv],
+            problem.boost[..., :n_cv],
         ]
-        recipe = [now["sp"], past[0]] if past else []
-        ordered = [mv.unsqueeze(-2)] if "given" in kept else []
-        state_next = torch.cat([now["one"], estimate, plan, measured, *levels, *recipe, *ordered], dim=-1).squeeze(-2)
+        one, estimate, *others = problem.next_kept.values()
+        ordered = [mv.unsqueeze(-2)] if "given" in problem.kept else []
+        state_next = torch.cat([one, estimate, plan, *others, *ordered], dim=-1).squeeze(-2)
         return mv, state_next, torch.cat(info, dim=-1).squeeze(-2)
 
     def _stands(self, mv_applied: Tensor, kept: Named) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import hardtanh
 
 from loopwright.pipeline.laws.base import hold_numbers
-from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, NetworkHorizon, product
+from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, NetworkHorizon, Prediction, product
 
 
 class SetPointCourse(nn.Module):
@@ -136,6 +136,20 @@ class SoftLimits(nn.Module):
         return limit_cost(y, self.low, self.high, self.price, self.soft, self.eps_squared)
 
 
+class LastPass(NamedTuple):
+    """The quadratic problem of the last pass, and the plan that its sweeps made of the one ``before``; scaled."""
+
+    plan: Tensor  # (..., 1, m)
+    before: Tensor  # (..., 1, m)
+    run: Prediction  # under ``before``
+    wanted: Tensor  # (..., 1, N n_o) set points within the outputs' ranges
+    weight: Tensor  # (..., 1, N n_o) of the errors
+    push: LimitCost  # of the ranges
+    stiff: Tensor  # (..., m, m) curvature of the costs of moves and of being away from rests
+    low: Tensor  # (..., 1, m) least value of each move
+    high: Tensor
+
+
 @dataclass(frozen=True, slots=True)
 class Cost:
     """Numbers of the cost: ``weights`` q of the CVs, ``move`` mu of a squared change, ``eps``; and the ``damping``.
@@ -229,7 +243,8 @@ class Planner(nn.Module):
         operators have it, see ``_operated``.
         """
         if operated is not None:
-            return self._operated(start, wanted, applied, plan, operated)
+            last = self.last_pass(start, wanted, applied, plan, operated)
+            return last.plan, self.ahead(last)
         n_cv = self.n_cv
         held, at = applied @ self.applied, applied @ self.first
         for _ in range(self.passes):
@@ -248,9 +263,12 @@ class Planner(nn.Module):
         ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
         return plan, ahead
 
-    def _operated(
-        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, by: OperatedPlan
-    ) -> tuple[Tensor, Tensor]:
+    def ahead(self, last: LastPass) -> Tensor:
+        """The outputs (..., 1, n_o) at the next sample."""
+        n_o = self.n_cv
+        return last.run.y[..., :n_o] + (last.plan - last.before) @ last.run.slopes[..., :n_o]
+
+    def last_pass(self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, by: OperatedPlan) -> LastPass:
         """The plan that is best with ranges, priorities, resting values and costs, within the operators' bounds.
 
             sum_k sum_o  t_o q_o sqrt((y_o - r_o)^2 + eps^2) + p_o(b_o) + c_o y_o
@@ -259,7 +277,7 @@ class Planner(nn.Module):
         t is 1 for a set point that is followed, b_o what lies beyond the range of output o, p_o the cost of
         ``SoftLimits`` with its price by rank, s the stiffness. A set point outside its range counts as the end of it.
         """
-        n_cv, stiff = self.n_cv, by.stiffness * self.moved + by.rest_weight * self.eye
+        stiff = by.stiffness * self.moved + by.rest_weight * self.eye
         at = applied @ self.first
         held = by.stiffness * (applied @ self.applied) + by.rest_weight * by.rest - by.z_cost
         wanted, weights = torch.minimum(torch.maximum(wanted, by.low), by.high), self.weights * by.track
@@ -283,8 +301,7 @@ class Planner(nn.Module):
                 plan = self._descended_within(curvature, pull, plan, middle, half)
             else:
                 plan = self.descended(curvature, pull, plan, at, (low, high, by.rate))
-        ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
-        return plan, ahead
+        return LastPass(plan, before, run, wanted, weight, push, stiff, low, high)
 
     def _damped(
         self, weighed: Tensor, slopes_t: Tensor, stiff: Tensor, pull: Tensor, plan: Tensor
@@ -368,12 +385,12 @@ class Planner(nn.Module):
                 for p in range(m):
                     plan = hardtanh(product(plan, into[p], add[p]))
                 continue
-            low, high = self._ends(product(plan, self.before, at), bounds)
+            low, high = self.ends(product(plan, self.before, at), bounds)
             for p in range(m):
                 plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
         return plan
 
-    def _ends(self, middle: Tensor, bounds: tuple[Tensor, Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
+    def ends(self, middle: Tensor, bounds: tuple[Tensor, Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
         """The ends of each move, whose move before is at ``middle`` (..., 1, m); ``bounds`` as in ``descended``."""
         if bounds is not None:
             least, most, rate = bounds
