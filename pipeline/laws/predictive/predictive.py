@@ -14,6 +14,7 @@ from loopwright.pipeline.laws.predictive.cold_rest import BentRest, bent_rest, h
 from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, loads_of
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of, product
 from loopwright.pipeline.laws.predictive.horizon_check import AnswerTimes, horizon_for, mvs_of, refuse_unstable
+from loopwright.pipeline.laws.predictive.known_future import KnownFuture, ahead_of
 from loopwright.pipeline.laws.predictive.observer import Noises, Observer, StateEstimate, load_variance
 from loopwright.pipeline.laws.predictive.operating import OperateScales, Operation, entries_of
 from loopwright.pipeline.laws.predictive.params import (
@@ -53,7 +54,7 @@ class Predictive(ControlLaw):
     of reach ends at the nearest output. The last plan, one sample on, is where the next one begins. The filter reads
     the MV that really acted: that is the anti-windup. Without a past it starts at the rest that fits the process
     variables and the applied MV, under the loads that hold it there: on set point it asks for that MV. The set points r
-    stay as they are, or go on with their last slope. CVs may have soft limits, whose cost is added. With ``operate``
+    stay as they are, go on with their last slope, or change, as the measured disturbances do, as ``ahead`` says. CVs may have soft limits, whose cost is added. With ``operate``
     operators give ranges, take signals out, and set priorities, resting values and costs while it runs.
 
     ``Observer``, ``LinearHorizon`` and ``NetworkHorizon``, ``Planner``, ``SetPointCourse`` and ``SoftLimits`` hold the
@@ -71,6 +72,7 @@ class Predictive(ControlLaw):
     calmer: tuple[Identified, PredictiveParams] | None = None  # of a search: model and numbers of last resort
     remarks: tuple[str, ...] = ()  # on a horizon that is short for the model
     operation: Operation | None  # of a law that reads ``operate`` and ``fresh``
+    known: KnownFuture | None  # of a law that reads ``ahead``
     operate_default: Tensor  # (n_operate,)
     same: Tensor  # (n_mv,) [mv] by which a read-back may be off the command
     variances: Tensor  # (n_o,) where the outputs' variances stand in the state's covariance
@@ -107,12 +109,15 @@ class Predictive(ControlLaw):
         rate = None if self.rate is None else self.rate / half
         # With `operate` further PVs that the model has as outputs have ranges, too.
         n_o = n_cv if params.operate is None else model.n_y
-        run = horizon_of(model, loads, self.moves, mv_of, n_o)
+        given = params.preview == "course"
+        run = horizon_of(model, loads, self.moves, mv_of, n_o, forecasts=given)
         bounds = self._bounds(model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
         self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls, valleys=n_mv > n_cv)
         self.wanted = self._set_points(model, bounds, n_o, ramp=params.preview == "ramp")
+        self.ahead = ahead_of(signals, horizon) if given else None
+        self.known = None if self.ahead is None else KnownFuture(self.ahead, model, n_o)
         self.operation = None
         if params.operate is not None:
             self._build_operation(model, params, n_o, max(weights), middle, half)
@@ -302,8 +307,13 @@ class Predictive(ControlLaw):
         state: Tensor,
         operate: Tensor | None = None,
         fresh: Tensor | None = None,
+        ahead: Tensor | None = None,
     ) -> Stepped:
-        """One step; shapes as in ControlLaw. ``operate`` (..., n_operate), ``fresh`` (..., n_pv); None: by default."""
+        """One step; shapes as in ControlLaw.
+
+        ``operate`` (..., n_operate), ``fresh`` (..., n_pv), ``ahead`` (..., N n) of the set points and measured
+        disturbances; None: by default.
+        """
         now = self.inputs(torch.cat([sp, pv, dv, mv_applied], dim=-1).unsqueeze(-2))
         parts = torch.split(state.unsqueeze(-2), list(self.kept.values()), dim=-1)
         kept = dict(zip(self.kept, parts, strict=True))
@@ -327,8 +337,9 @@ class Predictive(ControlLaw):
         levels = [self._level(measured, kept)] if "level" in kept else []
         start = torch.cat([mean, *(levels or [measured])], dim=-1)
         past = [torch.where(kept["started"] > 0, kept[n], now["sp"]) for n in ("sp", "sp_before") if n in kept]
-        wanted = self.wanted(self._of_outputs(now["sp"]), [self._of_outputs(p) for p in past])
-        plan, ahead = self.planner(start, wanted, applied, plan, operated)
+        later, forecast = self._later(ahead)
+        wanted = self.wanted(self._of_outputs(now["sp"]), [self._of_outputs(p) for p in past], later)
+        plan, soon = self.planner(start, wanted, applied, plan, operated, forecast)
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)
         if operated is not None:
             # The plan is within them already; in engineering units it is so up to rounding.
@@ -338,13 +349,20 @@ class Predictive(ControlLaw):
         mv = self.limited(mv, mv_applied)
         info = [
             self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],
-            self.y_center + self.y_scale * ahead[..., :n_cv],
+            self.y_center + self.y_scale * soon[..., :n_cv],
             boost[..., :n_cv],
         ]
         recipe = [now["sp"], past[0]] if past else []
         ordered = [mv.unsqueeze(-2)] if "given" in kept else []
         state_next = torch.cat([now["one"], estimate, plan, measured, *levels, *recipe, *ordered], dim=-1).squeeze(-2)
         return mv, state_next, torch.cat(info, dim=-1).squeeze(-2)
+
+    def _later(self, ahead: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        """What ``ahead`` adds to the set points over the horizon, and the horizon's offset under its disturbances."""
+        if self.known is None or ahead is None:
+            return None, None
+        later, dv = self.known(ahead)
+        return later, self.planner.horizon.forecast(dv) if dv.shape[-1] else None
 
     def _stands(self, mv_applied: Tensor, kept: Named) -> Tensor:
         """Where each MV goes on from (..., n_mv) [mv]: its last command, or the applied value where that is elsewhere.
