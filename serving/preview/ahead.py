@@ -9,11 +9,14 @@ are. Standard library only, as the manifest.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, Self, TypeAlias, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeAlias, get_args
 
 from loopwright.serving.errors import ArtifactError
+
+if TYPE_CHECKING:
+    from loopwright.serving.manifest import Signal
 
 AheadGroup: TypeAlias = Literal["sp", "dv"]
 
@@ -72,7 +75,7 @@ class Ahead:
         return self.horizon * len(self.signals)
 
     def require_fits(self, period_s: float, sp: Sequence[str], dv: Sequence[str]) -> None:
-        """ArtifactError unless the period is the law's, and the signals are its set points and then its disturbances."""
+        """ArtifactError unless period and signals are the law's: its set points, then its disturbances."""
         if self.period_s != period_s:
             raise ArtifactError(f"the manifest's ahead has the period {self.period_s} s, its law {period_s} s")
         if [(s.group, s.signal) for s in self.signals] != [*(("sp", n) for n in sp), *(("dv", n) for n in dv)]:
@@ -80,6 +83,12 @@ class Ahead:
             raise ArtifactError(
                 f"the manifest's ahead must list all set points and then all measured disturbances: {listed}"
             )
+
+    def with_disturbances(self, signals: Iterable[Signal]) -> Ahead:
+        """The same set points with these measured disturbances."""
+        sp = [s for s in self.signals if s.group == "sp"]
+        dv = [AheadSignal("dv", s.name, s.unit, s.low, s.high) for s in signals]
+        return replace(self, signals=(*sp, *dv))
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON-ready values."""

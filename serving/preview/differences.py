@@ -58,10 +58,16 @@ class Differences:
         now = present[..., None, :]
         then = now + given.reshape(*given.shape[:-1], self.ahead.horizon, len(self.ahead.signals))
         low, high = np.minimum(self._low, now) - self._slack, np.maximum(self._high, now) + self._slack
-        good = (then >= low) & (then <= high) & np.isfinite(then)
+        good = ((then >= low) & (then <= high)) | ~np.isfinite(now)  # the sample itself is refused for that
+        good &= np.isfinite(given).reshape(then.shape)
         return np.asarray(good).reshape(given.shape)
 
     def within(self, given: Array, present: Array) -> Array:
-        """The differences (N n,) nearest to ``given`` that may be given beside the present values (n,)."""
-        low, high = np.minimum(self._low, present) - present, np.maximum(self._high, present) - present
-        return np.asarray(np.clip(given.reshape(-1, len(present)), low, high)).ravel()
+        """The differences (N n,) nearest to ``given`` that may be given beside the present values (n,).
+
+        Zeros where a present value is not finite: the sample is refused for that.
+        """
+        known = np.isfinite(present)
+        now = np.where(known, present, self._low)
+        low, high = np.minimum(self._low, now) - now, np.maximum(self._high, now) - now
+        return np.where(known, np.clip(given.reshape(-1, len(now)), low, high), 0.0).ravel()
