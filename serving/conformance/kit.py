@@ -81,8 +81,9 @@ PASS_OF_OPERATED = (
     "left, where the law has no use of this PV, and where the PV was not read yet.",
 )
 PASS_OF_AHEAD = (
-    "given.ahead holds by how much set points and measured disturbances will differ from given.sp and given.dv: at each "
-    "of the horizon's samples one number of each signal, in the order of the manifest's ahead. All scans have zeros.",
+    "given.ahead holds by how much set points and measured disturbances will differ from given.sp and given.dv: at "
+    "each of the horizon's samples one number of each signal, in the order of the manifest's ahead. All scans have "
+    "zeros.",
 )
 
 

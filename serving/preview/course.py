@@ -72,6 +72,7 @@ class Courses:
         self._period_s = manifest.period_s
         self._periods = 0  # that have passed since the loop began
         self._of: dict[str, Course] = {}
+        self.finished: tuple[str, ...] = ()  # signals whose course came to its last point at the last scan
 
     @property
     def now_s(self) -> float:
@@ -88,8 +89,14 @@ class Courses:
         now = self.now_s
         return {
             name: [(t - now, v) for t, v in zip(of.times_s.tolist(), of.values.tolist(), strict=True) if t >= now]
-            for name, of in self._of.items()
+            for name, of in list(self._of.items())  # other threads ask, too
         }
+
+    @property
+    def ends(self) -> dict[str, tuple[float, float]]:
+        """The last point by signal: time [s] from the next scan on, and value."""
+        now = self.now_s
+        return {name: (float(of.times_s[-1]) - now, float(of.values[-1])) for name, of in list(self._of.items())}
 
     def give(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> None:
         """Courses of some signals, in place of those that they had; LoopError as ``checked``."""
@@ -148,12 +155,12 @@ class Courses:
             if s.name in self._of:
                 course = self._of[s.name] = self._of[s.name].begun(now, float(found[i]))
                 found = found.copy() if found is sp else found
-                found[i] = course.at(np.array(now), float(found[i]))
+                found[i] = course.at(np.array([now]), float(found[i]))[0]
         return found
 
-    def over(self) -> tuple[str, ...]:
-        """Forget the courses whose last point has come; their names."""
-        return self.end([name for name, of in self._of.items() if of.times_s[-1] <= self.now_s])
+    def over(self) -> None:
+        """Forget the courses whose last point has come; ``finished`` are their names."""
+        self.finished = self.end([name for name, of in self._of.items() if of.times_s[-1] <= self.now_s])
 
     def ahead(self, manifest: Manifest, sp: Array, dv: ArrayLike | None) -> Array | None:
         """``ahead`` (N n,) of a controller at this scan, within its signals' ranges.
@@ -167,16 +174,16 @@ class Courses:
         measured = np.full(len(self._dv), np.nan) if dv is None else np.asarray(dv, dtype=np.float64).reshape(-1)
         known |= dict(zip((s.name for s in self._dv), measured.tolist(), strict=True))
         now = self.now_s
-        times = now + self._period_s * np.arange(1, manifest.ahead.horizon + 1)
+        times: Array = now + self._period_s * np.arange(1.0, manifest.ahead.horizon + 1)
         change = np.zeros((len(times), len(manifest.ahead.signals)))
         for i, s in enumerate(manifest.ahead.signals):
             if s.signal in self._of:
                 present = known[s.signal]
                 course = self._of[s.signal] = self._of[s.signal].begun(now, present)
-                begins = course.at(np.array(now), present) if s.group == "dv" else present
+                begins = course.at(np.array([now]), present) if s.group == "dv" else present
                 change[:, i] = course.at(times, present) - begins
-        present = np.array([known[s.signal] for s in manifest.ahead.signals])
-        return Differences(manifest.ahead).within(change, present)
+        values: Array = np.array([known[s.signal] for s in manifest.ahead.signals])
+        return Differences(manifest.ahead).within(change, values)
 
 
 def _pairs(name: str, points: Any) -> list[tuple[float, float]]:

@@ -45,6 +45,7 @@ class Snapshot:
     missed: int  # periods
     faults: int  # scans
     operate: tuple[float, ...]  # as operators want it of the controller in charge
+    courses: Mapping[str, tuple[float, float]]  # last point of each: time [s] from the next scan on, value
     verdicts: tuple[Verdict, ...]
     numbers: Mapping[str, float]
 
@@ -65,7 +66,10 @@ class Snapshot:
             successor = {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
         told = tuple(monitor.verdicts()), monitor.numbers()
         operate = tuple(map(float, loop.operate))
-        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, operate, *told)
+        steered = operate, loop.courses.ends
+        return cls(
+            seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, *steered, *told
+        )
 
 
 def about(station: Station) -> View:
@@ -80,6 +84,7 @@ def about(station: Station) -> View:
         "signals": {name: [s.to_dict() for s in signals] for name, signals in groups.items()},
         "info": list(m.info),
         "operate": [{"name": e.name, **e.to_dict()} for e in m.operate],
+        "ahead": None if m.ahead is None else m.ahead.to_dict(),
         "columns": columns(m),
         "card": _card(controller),
         "folder": str(controller.path.absolute().parent),
@@ -123,6 +128,7 @@ def state(station: Station) -> View:
         "dv": _plain(None if sample is None else sample.dv),
         "info": _plain(command.info if seen.stepped is seen.controller else None),  # of the names in ``about``
         "operate": list(seen.operate),  # of the names in ``about``
+        "courses": {name: {"ends_in_s": at, "at": value} for name, (at, value) in seen.courses.items()},
         "bridged": dict(command.bridged),
         "shed": dict(command.shed),
         "quality": [] if sample is None else [words(status) for status in sample.quality],

@@ -107,7 +107,9 @@ def page(controller: Controller) -> bytes:
         for r in rows
     )
     title = html.escape(words_of(controller))
-    further = [words for name, words in (("mv_applied", APPLIED), ("operate", OPERATED), ("ahead", KNOWN)) if name in m.inputs]
+    further = [
+        words for name, words in (("mv_applied", APPLIED), ("operate", OPERATED), ("ahead", KNOWN)) if name in m.inputs
+    ]
     return (
         f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title>\n<h1>{title}</h1>\n'
         f"{SAMPLING.format(period=m.period_s)}\n{chr(10).join(further)}\n"
@@ -154,7 +156,9 @@ def _start_of(output: ScalarVariable, rows: list[ScalarVariable]) -> list[Scalar
 
 def _common(row: ScalarVariable) -> dict[str, str]:
     varies = {"output": "discrete", "parameter": "fixed"}.get(row.causality, "continuous")
-    varies = {"operate": "tunable", "fresh": "discrete", "ahead": "discrete"}.get(row.group, varies)  # a tool interpolates no flag
+    varies = {"operate": "tunable", "fresh": "discrete", "ahead": "discrete"}.get(
+        row.group, varies
+    )  # a tool interpolates no flag
     found = {"name": row.name, "valueReference": str(row.reference), "causality": row.causality, "variability": varies}
     return found | {"description": row.words} | ({"initial": "calculated"} if row.causality == "output" else {})
 
@@ -244,7 +248,8 @@ NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]
 class ScalarVariable:
     """A scalar variable.
 
-    ``group``: sp, pv, dv, mv_applied, mv_start, mv, info, operate, fresh, ahead; time, fault, use_mv_applied or use_fresh.
+    ``group``: sp, pv, dv, mv_applied, mv_start, mv, info, operate, fresh, ahead; time, fault, use_mv_applied or
+    use_fresh.
     ``low``, ``high`` and ``start`` are None where there is none.
     """
 

@@ -54,8 +54,9 @@ class Predictive(ControlLaw):
     of reach ends at the nearest output. The last plan, one sample on, is where the next one begins. The filter reads
     the MV that really acted: that is the anti-windup. Without a past it starts at the rest that fits the process
     variables and the applied MV, under the loads that hold it there: on set point it asks for that MV. The set points r
-    stay as they are, go on with their last slope, or change, as the measured disturbances do, as ``ahead`` says. CVs may have soft limits, whose cost is added. With ``operate``
-    operators give ranges, take signals out, and set priorities, resting values and costs while it runs.
+    stay as they are, go on with their last slope, or change as ``ahead`` says, and so may the measured disturbances.
+    CVs may have soft limits, whose cost is added. With ``operate`` operators give ranges, take signals out, and set
+    priorities, resting values and costs while it runs.
 
     ``Observer``, ``LinearHorizon`` and ``NetworkHorizon``, ``Planner``, ``SetPointCourse`` and ``SoftLimits`` hold the
     formulas and their sources.
