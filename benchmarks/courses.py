@@ -151,9 +151,8 @@ def recipes(seeds: int) -> None:
             plants = [ONE if where == "the model" else ONE.other(s) for s in range(seeds)]
             found = [loop(law, p, sp, none, s, none) for s, p in enumerate(plants)]
             error, travel = 100 * np.array([e for e, _ in found]) / span, [t for _, t in found]
-            print(
-                f"  {where:<16} {word:<7} {error.mean():6.2f} ({error.min():.2f} to {error.max():.2f})  {np.mean(travel):5.2f}"
-            )
+            spread = f"({error.min():.2f} to {error.max():.2f})"
+            print(f"  {where:<16} {word:<7} {error.mean():6.2f} {spread}  {np.mean(travel):5.2f}")
 
 
 def feeds(seeds: int) -> None:
@@ -190,9 +189,8 @@ def steps() -> None:
         coming = 0.1 * np.ones(course.manifest.sizes()["ahead"])
         turns = np.array([[_median(held), _median(course), _median(course, coming)] for _ in range(7)])
         best = turns.min(axis=0)
-        print(
-            f"  {name:<22} {best[0]:6.1f} {best[1]:6.1f} {best[2]:6.1f}  {best[1] / best[0]:.2f} {best[2] / best[0]:.2f}"
-        )
+        took = " ".join(f"{us:6.1f}" for us in best)
+        print(f"  {name:<22} {took}  {best[1] / best[0]:.2f} {best[2] / best[0]:.2f}")
 
 
 def _median(controller: Controller, coming: Array | None = None) -> float:

@@ -129,7 +129,8 @@ def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     """The graph of one step as the law is written, and the inputs that it uses, in the order of the contract.
 
     Inputs ``sp, pv, dv, mv_applied, state``, of a law that reads them ``operate, fresh, ahead``, and outputs ``mv,
-    state_next, info``, all float64 of rank 1; an input that the law does not use and an output of size zero are left out.
+    state_next, info``, all float64 of rank 1; an input that the law does not use and an output of size zero are left
+    out.
 
     Raises ExportError where the law cannot be such a graph.
     """
