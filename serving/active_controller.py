@@ -17,6 +17,7 @@ from loopwright.serving.fields import shown
 from loopwright.serving.guard import Guard, Sample
 from loopwright.serving.manifest import INPUTS, Manifest, Signal
 from loopwright.serving.operating import Operate
+from loopwright.serving.preview.course import Courses
 from loopwright.serving.words import first_line, named
 
 # ---------------------------------------------------------------------- a controller in a loop that reads more signals
@@ -49,6 +50,7 @@ class AdaptedController(Controller):
         dv: ArrayLike | None = None,
         operate: ArrayLike | None = None,
         fresh: ArrayLike | None = None,
+        ahead: ArrayLike | None = None,
     ) -> Step:
         """One step, on all PVs and measured disturbances of the loop."""
         step = self.inner.step(
@@ -59,6 +61,7 @@ class AdaptedController(Controller):
             dv=_picked(dv, self._dv, self.manifest.dv, "dv") if "dv" in self.inner.manifest.inputs else None,
             operate=operate,
             fresh=None if fresh is None else _picked(fresh, self._pv, self.manifest.pv, "fresh"),
+            ahead=None if ahead is None or self.manifest.ahead is None else self._known_ahead(ahead),
         )
         applied = np.asarray(mv_applied, dtype=np.float64).reshape(step.mv.shape)
         mv = [
@@ -66,6 +69,12 @@ class AdaptedController(Controller):
             for s, at, wanted in zip(self.manifest.mv, applied, step.mv, strict=True)
         ]
         return step._replace(mv=np.array(mv))
+
+    def _known_ahead(self, ahead: ArrayLike) -> Array:
+        """What is to come of the controller's own set points and measured disturbances."""
+        n_sp, loops = len(self.manifest.sp), len(self.manifest.sp) + len(self.manifest.dv)
+        own = [*range(n_sp), *(n_sp + place for place in self._dv)]
+        return np.asarray(ahead, dtype=np.float64).reshape(-1, loops)[:, own].ravel()
 
     def warm(self) -> None:
         """Compute a first step, as ``Controller.warm`` does."""
@@ -133,7 +142,9 @@ def _seen_as(own: Manifest, loop: Manifest) -> Manifest:
     if set(inputs) == set(own.inputs):
         inputs = own.inputs
     mv = tuple(replace(s, low=o.low, high=o.high) for s, o in zip(own.mv, loop.mv, strict=True))
-    return replace(own, pv=_ranged(loop.pv, own.pv), mv=mv, dv=_ranged(loop.dv, own.dv), inputs=inputs)
+    dv = _ranged(loop.dv, own.dv)
+    ahead = None if own.ahead is None else own.ahead.with_disturbances(dv)
+    return replace(own, pv=_ranged(loop.pv, own.pv), mv=mv, dv=dv, inputs=inputs, ahead=ahead)
 
 
 def _ranged(loop: Sequence[Signal], own: Sequence[Signal]) -> tuple[Signal, ...]:
@@ -176,6 +187,12 @@ def _inputs(controller: Controller, readings: Readings, operate: Array) -> dict[
     return found
 
 
+def _known(controller: Controller, courses: Courses | None, sp: Array, sample: Sample) -> dict[str, ArrayLike]:
+    """``ahead`` where a course says something to a law that reads it."""
+    found = None if courses is None else courses.ahead(controller.manifest, sp, sample.dv)
+    return {} if found is None else {"ahead": found}
+
+
 class Successor:
     """Steps a new controller on the samples of the one in charge; its MV is shown and not written.
 
@@ -202,8 +219,12 @@ class Successor:
         applied: Array,
         past: Collection[Sample] = (),
         wishes: Mapping[str, float] | None = None,
+        courses: Courses | None = None,
     ) -> None:
-        """One scan; ``past`` ends with the sample before it, ``wishes`` are values of ``operate`` that somebody set."""
+        """One scan; ``past`` ends with the sample before it, ``wishes`` are values of ``operate`` that somebody set.
+
+        ``courses`` are those of the loop.
+        """
         try:
             self.operate = self.operating.taken_over(wishes or {})
         except ContractError as error:
@@ -219,6 +240,7 @@ class Successor:
                 return
         try:
             more = _inputs(self.controller, readings, self.bridging.used(self.operate, readings))
+            more |= _known(self.controller, courses, sp, sample)
             step: Step = self.controller.step(sp=sp, dv=sample.dv, mv_applied=applied, state=self.state, **more)
         except Exception as error:  # the controller in charge goes on, whatever this one does
             self.miss(named(error))
@@ -271,6 +293,7 @@ class ActiveController:
         self.operating = Operate(controller.manifest.operate)
         self.operate = self.operating.default
         self.wishes: dict[str, float] = {}
+        self.courses = Courses(controller.manifest)  # of set points and measured disturbances, whoever is in charge
         self._made = guards if callable(guards) else None
         self.guards: tuple[Guard, ...] = tuple(guards(controller.manifest) if callable(guards) else guards)
         self._bridging = Bridging(controller.manifest, bridge_s, critical)
@@ -305,11 +328,18 @@ class ActiveController:
         self.operate = self.operate_with(values)
         self.wishes |= {name: float(self.operate[self.operating.places[name]]) for name in values}
 
+    def require_ahead(self) -> None:
+        """LoopError for a law that does not read what is to come."""
+        m = self.controller.manifest
+        if "ahead" not in m.inputs:
+            raise LoopError(f"{m.law} has no ahead: it cannot be given a course; design it with `preview: course`")
+
     def step(self, readings: Readings, sp: Array, applied: Array) -> Step:
         """One step of the law. It raises what the law raises; ``forget`` then, as the state is of no use any more."""
         sample = readings.sample
         self._before = tuple(self._past) if self.successor is not None else ()
         more = _inputs(self.controller, readings, self._bridging.used(self.operate, readings))
+        more |= _known(self.controller, self.courses, sp, sample)
         given = {"sp": sp, "dv": sample.dv, "mv_applied": applied, "state": self._state, **more}
         step = self.controller.step(**given)
         read = self.controller.manifest.inputs  # another one may hold anything
@@ -325,7 +355,7 @@ class ActiveController:
         new = self.successor
         if new is None:
             return None
-        new.step(sample, sp, applied, self._before, self.wishes)
+        new.step(sample, sp, applied, self._before, self.wishes, self.courses)
         if new.ready:
             self.replaced, self.successor = self.controller, None
             self.controller, self._state, self.stepped = new.controller, new.state, None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from math import inf, isnan, nan
 from typing import TypeAlias
@@ -18,6 +18,7 @@ from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Guard, Sample, default_guards, reworded
 from loopwright.serving.modes import ByHand, Command, Fallback, LoopMode, Mode, Transfer, mode_of
 from loopwright.serving.mv_readback import AppliedMV
+from loopwright.serving.preview.course import Courses, Points
 from loopwright.serving.ranges import within
 from loopwright.serving.scan_grid import RunReport, run_on_grid
 from loopwright.serving.words import first_line
@@ -221,9 +222,31 @@ class ControlLoop:
             self._hand.wanted = None
         self._mode.set(mode)
 
-    def set_sp(self, sp: ArrayLike) -> None:
-        """Change the set points (n_sp,); LoopError outside their ranges."""
-        self._sp = within(sp, self.controller.manifest.sp, "set point")
+    def set_sp(self, sp: ArrayLike) -> tuple[str, ...]:
+        """Change the set points (n_sp,), whose courses end; the names of those. LoopError outside their ranges."""
+        before, self._sp = self._sp, within(sp, self.controller.manifest.sp, "set point")
+        moved = zip(self.manifest.sp, before.tolist(), self._sp.tolist(), strict=True)
+        return self.courses.end([s.name for s, old, new in moved if old != new])
+
+    @property
+    def courses(self) -> Courses:
+        """The courses of set points and measured disturbances; ``set_course`` gives some, and its ``end`` ends them."""
+        return self._active.courses
+
+    def set_course(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> None:
+        """Give known set points and forecasts of measured disturbances, by name, as points (time [s], value).
+
+        Times count from the next scan on. Set points and the law follow them in every mode, see ``Courses``; ``set_sp``
+        ends the course of a set point. LoopError for a law that does not read ``ahead``, and for points that cannot be;
+        then nothing is changed.
+        """
+        self.require_course(points, straight)
+        self.courses.give(points, straight)
+
+    def require_course(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> None:
+        """LoopError where ``set_course`` would refuse."""
+        self._active.require_ahead()
+        self.courses.checked(points, straight)
 
     @property
     def operate(self) -> Array:
@@ -261,6 +284,7 @@ class ControlLoop:
     # ------------------------------------------------------------------ one scan
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
+        self._sp = self.courses.followed(self._sp)
         readings = self._active.look(sample)
         reason, self._refused_why = readings.reason, ""
         self._applied.arrived()
@@ -310,6 +334,7 @@ class ControlLoop:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
         self._applied.arrived()
         self.found = None
+        self._sp = self.courses.followed(self._sp)
         self._active.missed(1)
         return self._without_sample(reason)
 
@@ -331,11 +356,13 @@ class ControlLoop:
         self._applied.lose()
         self._lose(reason)
         self._scan -= 1
+        self.courses.passed(-1)  # this scan is counted already
         return self._command(None, None, reason)
 
     def gap(self, periods: int) -> None:
         """So many periods passed without a scan; the law starts cold after more than ``max_gap``."""
         self._active.missed(periods)
+        self.courses.passed(periods)
         if periods > self.max_gap:
             self._active.begin_cold(f"{periods} periods were missed")
             self._transfer.begin()  # a law that starts cold may want another MV at once
@@ -356,6 +383,8 @@ class ControlLoop:
 
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
+        self.courses.over()
+        self.courses.passed(1)
         back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
         command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back)
         self._applied.command(self._mv, written=command.writes)

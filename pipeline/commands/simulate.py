@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import ParamSpec, TypeVar
@@ -30,6 +31,8 @@ from loopwright.serving.endpoint import Array
 from loopwright.serving.guard import Sample
 from loopwright.serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest
+from loopwright.serving.preview.course import Courses, Points
+from loopwright.serving.preview.course_file import read_courses
 
 LIVE_RECOVERY = 5  # good samples
 P = ParamSpec("P")
@@ -56,6 +59,10 @@ def options(parser: argparse.ArgumentParser) -> None:
         "standard deviation of a reading's noise, of a measured disturbance too, over the whole run",
     )
     events("--operate", "NAME=VALUE", "of what operators may change, another value than the file's default")
+    add("--course", metavar="FILE.csv", type=Path,
+        help="set points and measured disturbances by time from the start, which the law knows before")  # fmt: skip
+    add("--straight", metavar="NAME", action="append", default=[],
+        help="a set point of the course that runs straight to each value")  # fmt: skip
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip
     add("--duration", metavar="S", type=positive("s"), help="length of the run")
@@ -100,7 +107,13 @@ def run(options: argparse.Namespace) -> None:
         )
     title = f"{controller.manifest.law} on {plant.title}"
     operate = {event.name: event.value for event in options.operate}
-    history = close_loop(controller, plant, course, title=title, speed=options.speed, operate=operate)
+    known = None
+    if options.course is not None:
+        known = KnownCourses(read_courses(options.course, time.time()), tuple(options.straight))
+        course = known.happening(controller.manifest, course, {event.name for event in options.disturbance})
+    elif options.straight:
+        raise ParamsError("--straight says how a set point of a course runs; give the course by --course FILE.csv")
+    history = close_loop(controller, plant, course, title=title, speed=options.speed, operate=operate, known=known)
     print(summary(plant, history, METRICS["mae"] if case is None else case.criterion))
     picture = options.picture or Path(f"{controller.manifest.law}-simulation.png")
     draw(picture, plant, history, title, course.marks)
@@ -118,10 +131,12 @@ def close_loop(
     title: str,
     speed: float | None = None,
     operate: Mapping[str, float] | None = None,
+    known: KnownCourses | None = None,
 ) -> History:
     """Run the controller's ControlLoop over the plant and show it; ``speed`` None is as fast as possible.
 
-    ``operate`` are values that operators have changed, by name; LoopError for a wrong one.
+    ``operate`` are values that operators have changed, by name, ``known`` what is known of the future; LoopError for a
+    wrong one. A set point with a course follows it, and not the timetable.
     """
     simulated, history = SimulatedPlant(plant, course), History()
     # The loop outlives whatever raises, as a plant needs it to; a simulation that raised is over.
@@ -150,6 +165,9 @@ def close_loop(
         warm_lead_s=0.0 if speed is None else WARM_LEAD_S * speed,
         operate=operate,
     )
+    if known is not None:
+        loop.set_course(known.points, known.straight)
+    followed = np.array([known is not None and s.name in known.points for s in controller.manifest.sp])
     period, n = plant.period_s, len(course.sp)
     marks = {round(at / period): text for at, text in course.marks.items()}
 
@@ -157,7 +175,7 @@ def close_loop(
         # A period that a slow machine missed passed in the plant too, with the MV held.
         while simulated.k < k:
             simulated.write(simulated.mv)
-        loop.set_sp(course.sp[k])
+        loop.set_sp(np.where(followed, loop.sp, course.sp[k]))
         span = course.manual_at(k * period)
         if span is not None and loop.mode is not Mode.MANUAL:
             loop.set_mode(Mode.MANUAL)
@@ -184,6 +202,29 @@ def close_loop(
     if failed:
         raise failed[0]
     return history
+
+
+@dataclass(frozen=True, slots=True)
+class KnownCourses:
+    """Courses by signal, times from the run's start, and the names of set points that run straight."""
+
+    points: Mapping[str, Points]
+    straight: tuple[str, ...] = ()
+
+    def happening(self, manifest: Manifest, run: Timetable, others: Collection[str] = ()) -> Timetable:
+        """The run in which measured disturbances become what is forecast, but for the ``others``.
+
+        LoopError for a course that cannot be.
+        """
+        given = {course.signal: course for course in Courses(manifest).checked(self.points, self.straight)}
+        n = len(run.sp)
+        nominal = run.plant.dv_nominal
+        dv = np.tile(nominal, (n, 1)) if run.dv is None else run.dv.copy()
+        for i, s in enumerate(manifest.dv):
+            if s.name in given and s.name not in others:
+                times: Array = run.plant.period_s * np.arange(n, dtype=np.float64)
+                dv[:, i] = given[s.name].begun(0.0, float(dv[0, i])).at(times, float(dv[0, i]))
+        return replace(run, dv=dv)
 
 
 @dataclass(frozen=True)

@@ -129,8 +129,9 @@ OUTPUTS = ("mv", "state_next", "info")
 def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     """The graph of one step as the law is written, and the inputs that it uses, in the order of the contract.
 
-    Inputs ``sp, pv, dv, mv_applied, state``, of a law that reads them ``operate, fresh``, and outputs ``mv, state_next,
-    info``, all float64 of rank 1; an input that the law does not use and an output of size zero are left out.
+    Inputs ``sp, pv, dv, mv_applied, state``, of a law that reads them ``operate, fresh, ahead``, and outputs ``mv,
+    state_next, info``, all float64 of rank 1; an input that the law does not use and an output of size zero are left
+    out.
 
     Raises ExportError where the law cannot be such a graph.
     """
@@ -164,13 +165,17 @@ def module_graph(
 
 
 def example_inputs(law: ControlLaw) -> tuple[torch.Tensor, ...]:
-    """``sp, pv, dv, mv_applied, state`` of the law's sizes, all zero; ``operate`` by its defaults, all ``fresh``."""
+    """``sp, pv, dv, mv_applied, state`` of the law's sizes, all zero; ``operate`` by its defaults, all ``fresh``.
+
+    A law that reads ``ahead`` has the two before it, too, of size zero where it does not read them; zeros then.
+    """
     sizes = (*(len(getattr(law.signals, name)) for name in ("sp", "pv", "dv", "mv")), law.n_state)
     zeros = tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
-    if not law.operate:
+    if not law.operate and law.ahead is None:
         return zeros
     defaults = torch.tensor([entry.default for entry in law.operate], dtype=torch.float64)
-    return (*zeros, defaults, torch.ones(sizes[1], dtype=torch.float64))
+    steered = (*zeros, defaults, torch.ones(sizes[1] if law.operate else 0, dtype=torch.float64))
+    return steered if law.ahead is None else (*steered, torch.zeros(law.ahead.size, dtype=torch.float64))
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,8 @@ class Recorder:
             what = lasting(command.fault) or f"over: {lasting(before)}"
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.fault))
         self._bridged(command)
+        for name in loop.courses.finished:
+            self.note("change", "loop", f"the course of {name} is over")
         self._changed(command)
         if loop.controller is not self.controller:
             self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")

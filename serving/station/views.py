@@ -52,6 +52,7 @@ class Snapshot:
     operated: tuple[tuple[float, tuple[float, ...]], ...]  # since when these and earlier values of it hold
     inputs: LawInputs | None  # of the last step of the controller in charge
     stepped_s: float  # since 1970, when that was
+    courses: Mapping[str, tuple[float, float]]  # last point of each: time [s] from the next scan on, value
     verdicts: tuple[Verdict, ...]
     numbers: Mapping[str, float]
 
@@ -80,7 +81,7 @@ class Snapshot:
         if not operated or operated[-1][1] != operate:
             operated = (*operated[1 - MOST_OPERATED :], (seen_s, operate))
         stepped_s = seen_s if command.law_mv is not None or before is None else before.stepped_s
-        past = (operate, operated, loop.stepped, stepped_s)
+        past = (operate, operated, loop.stepped, stepped_s, loop.courses.ends)
         return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, *past, *told)
 
 
@@ -98,6 +99,7 @@ def about(station: Station) -> View:
         "operate": [{"name": e.name, **e.to_dict()} for e in m.operate],
         "operated": [] if station.snapshot is None else [[at, list(of)] for at, of in station.snapshot.operated],
         "bridge_s": BRIDGE_PERIODS * m.period_s if (of := station.settings.fresh.bridge_s) is None else of,
+        "ahead": None if m.ahead is None else m.ahead.to_dict(),
         "columns": columns(m),
         "card": _card(controller),
         "folder": str(controller.path.absolute().parent),
@@ -141,6 +143,7 @@ def state(station: Station) -> View:
         "dv": _plain(None if sample is None else sample.dv),
         "info": _plain(command.info if seen.stepped is seen.controller else None),  # of the names in ``about``
         "operate": list(seen.operate),  # of the names in ``about``
+        "courses": {name: {"ends_in_s": at, "at": value} for name, (at, value) in seen.courses.items()},
         "bridged": dict(command.bridged),
         "shed": dict(command.shed),
         "unread_s": None if seen.inputs is None else _plain(seen.inputs.unread_s),

@@ -17,8 +17,9 @@ from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, Ne
 class SetPointCourse(nn.Module):
     """Set points r(k+1) .. r(k+N) from those of now and, with ``ramp``, of the two samples before.
 
-        held:  r(k+i) = r(k)
-        ramp:  r(k+i) = clip(r(k) + i s),   s = the smaller of r(k) - r(k-1) and r(k-1) - r(k-2)
+        held:    r(k+i) = r(k)
+        ramp:    r(k+i) = clip(r(k) + i s),   s = the smaller of r(k) - r(k-1) and r(k-1) - r(k-2)
+        course:  r(k+i) = r(k) + a(i),        a(i) as it is given
 
     s is 0 where the two changes differ in their signs or one is 0: a step of the set point is no ramp, and the slope
     of a recipe is believed from its second sample on. ``bounds`` are the ends of the clip: the CVs' soft limits, as a
@@ -37,14 +38,19 @@ class SetPointCourse(nn.Module):
         for name, values in {"low": low, "high": high, "samples": samples}.items():
             self.register_buffer(name, values)
 
-    def forward(self, now: Tensor, past: list[Tensor]) -> Tensor:
-        """The set points (..., 1, N n_cv), from ``now`` (..., 1, n_cv); ``past`` [r(k-1), r(k-2)] with ``ramp``."""
+    def forward(self, now: Tensor, past: list[Tensor], later: Tensor | None = None) -> Tensor:
+        """The set points (..., 1, N n_cv), from ``now`` (..., 1, n_cv); ``past`` [r(k-1), r(k-2)] with ``ramp``.
+
+        ``later`` (..., 1, N n_cv) a(1) .. a(N), where the course is given.
+        """
         course = self._held(now)
         if self.samples is not None:
             last, older = past
             change, before = now - last, last - older
             slope = torch.minimum(torch.maximum(change, before.clamp(max=0.0)), before.clamp(min=0.0))
             course = course + self.samples * self._held(slope)
+        if later is not None:
+            course = course + later
         if self.low is not None and self.high is not None:
             course = torch.minimum(torch.maximum(course, self.low), self.high)
         return course
@@ -234,21 +240,27 @@ class Planner(nn.Module):
         hold_numbers(self, soft=SOFT, soft_squared=EPS**2, near=AT_BOUND)
 
     def forward(
-        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, operated: OperatedPlan | None = None
+        self,
+        start: Tensor,
+        wanted: Tensor,
+        applied: Tensor,
+        plan: Tensor,
+        operated: OperatedPlan | None = None,
+        forecast: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The plan (..., 1, m), and the outputs (..., 1, n_cv) that it gives at the next sample.
 
         From ``start`` (..., 1, n_x + n_y + n_dv), with the set points ``wanted`` (..., 1, N n_cv) over the horizon,
         the ``applied`` MV (..., 1, n_mv) within -1..1, beginning at ``plan``; all scaled. With ``operated`` as
-        operators have it, see ``_operated``.
+        operators have it, see ``_operated``. ``forecast`` is the horizon's offset where measured disturbances change.
         """
         if operated is not None:
-            last = self.last_pass(start, wanted, applied, plan, operated)
+            last = self.last_pass(start, wanted, applied, plan, operated, forecast)
             return last.plan, self.ahead(last)
         n_cv = self.n_cv
         held, at = applied @ self.applied, applied @ self.first
         for _ in range(self.passes):
-            run = self.horizon(start, plan)
+            run = self.horizon(start, plan, forecast)
             error = run.y - wanted
             weight = self.weights / torch.sqrt(error * error + self.eps_squared)
             push = None if self.limits is None else self.limits(run.y)
@@ -268,7 +280,15 @@ class Planner(nn.Module):
         n_o = self.n_cv
         return last.run.y[..., :n_o] + (last.plan - last.before) @ last.run.slopes[..., :n_o]
 
-    def last_pass(self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, by: OperatedPlan) -> LastPass:
+    def last_pass(
+        self,
+        start: Tensor,
+        wanted: Tensor,
+        applied: Tensor,
+        plan: Tensor,
+        by: OperatedPlan,
+        forecast: Tensor | None = None,
+    ) -> LastPass:
         """The plan that is best with ranges, priorities, resting values and costs, within the operators' bounds.
 
             sum_k sum_o  t_o q_o sqrt((y_o - r_o)^2 + eps^2) + p_o(b_o) + c_o y_o
@@ -288,7 +308,7 @@ class Planner(nn.Module):
         )
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         for _ in range(self.passes):
-            run = self.horizon(start, plan + by.off)
+            run = self.horizon(start, plan + by.off, forecast)
             error = run.y - wanted
             weight = weights / torch.sqrt(error * error + self.eps_squared)
             push = limit_cost(run.y, by.low_inside, by.high_inside, by.price, self.soft, self.soft_squared)
