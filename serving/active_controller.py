@@ -16,6 +16,8 @@ from loopwright.serving.errors import ContractError, LoopError
 from loopwright.serving.fields import shown
 from loopwright.serving.guard import Guard, Sample
 from loopwright.serving.manifest import INPUTS, Manifest, Signal
+from loopwright.serving.mvs.in_hand import MvEntries, Those
+from loopwright.serving.mvs.local_mvs import none_left
 from loopwright.serving.operating import Operate
 from loopwright.serving.preview.course import Courses
 from loopwright.serving.words import first_line, named
@@ -207,6 +209,7 @@ class Successor:
         self.bridging = bridging or Bridging(controller.manifest)
         self.operating = Operate(controller.manifest.operate)
         self.operate = self.operating.default  # shape: (n_operate,)
+        self.mv_entries = MvEntries(controller.manifest)
         self.state = controller.cold_state()
         self.good = 0
         self.mv: Array | None = None  # shape: (n_mv,), of the last scan; None where there is none
@@ -220,10 +223,13 @@ class Successor:
         past: Collection[Sample] = (),
         wishes: Mapping[str, float] | None = None,
         courses: Courses | None = None,
+        away: Those | None = None,
+        held: Array | None = None,
     ) -> None:
         """One scan; ``past`` ends with the sample before it, ``wishes`` are values of ``operate`` that somebody set.
 
-        ``courses`` are those of the loop.
+        ``courses`` are those of the loop, ``away`` (n_mv,) MVs that the plant has, ``held`` (n_mv,) what is commanded
+        of those out of use.
         """
         try:
             self.operate = self.operating.taken_over(wishes or {})
@@ -239,7 +245,9 @@ class Successor:
                 self.miss(f"the set point {s.name} = {value:g} is outside its range [{s.low:g}, {s.high:g}] {s.unit}")
                 return
         try:
-            more = _inputs(self.controller, readings, self.bridging.used(self.operate, readings))
+            used, entries = self.bridging.used(self.operate, readings), self.mv_entries
+            out = ~entries.used(self.operate) | (entries.able & (False if away is None else away))
+            more = _inputs(self.controller, readings, entries.told(used, out, held, self.mv))
             more |= _known(self.controller, courses, sp, sample)
             step: Step = self.controller.step(sp=sp, dv=sample.dv, mv_applied=applied, state=self.state, **more)
         except Exception as error:  # the controller in charge goes on, whatever this one does
@@ -297,14 +305,24 @@ class ActiveController:
         self._made = guards if callable(guards) else None
         self.guards: tuple[Guard, ...] = tuple(guards(controller.manifest) if callable(guards) else guards)
         self._bridging = Bridging(controller.manifest, bridge_s, critical)
+        self.mv_entries = MvEntries(controller.manifest)
         self._state = controller.cold_state()
         self.stepped: LawInputs | None = None
+        self._given: Array | None = None  # shape: (n_mv,), what the law gave last; None without a past
         self._past = deque[Sample](maxlen=_longest(self.guards))
         self._before: tuple[Sample, ...] = ()  # the past of the present sample, for the successor
 
-    def look(self, sample: Sample) -> Readings:
-        """The readings of a sample that the law may act on, or why it may not."""
+    @property
+    def in_hand(self) -> Those:
+        """The MVs (n_mv,) that operators have taken out."""
+        return ~self.mv_entries.used(self.operate)
+
+    def look(self, sample: Sample, local: Mapping[str, str]) -> Readings:
+        """The readings of a sample that the law may act on, or why it may not; the plant has the MVs ``local``."""
         readings = self._bridging.look(sample, self.guards, self._past, self.operate)
+        if not readings.reason and local:
+            why = none_left(self.controller.manifest.mv, local, self.mv_entries.used(self.operate))
+            readings = replace(readings, reason=why)
         if readings.reason and self.successor is not None:
             self.successor.bridging.missed()
         return readings
@@ -334,11 +352,16 @@ class ActiveController:
         if "ahead" not in m.inputs:
             raise LoopError(f"{m.law} has no ahead: it cannot be given a course; design it with `preview: course`")
 
-    def step(self, readings: Readings, sp: Array, applied: Array) -> Step:
-        """One step of the law. It raises what the law raises; ``forget`` then, as the state is of no use any more."""
+    def step(self, readings: Readings, sp: Array, applied: Array, out: Those, held: Array | None) -> Step:
+        """One step of the law. It raises what the law raises; ``forget`` then, as the state is of no use any more.
+
+        ``out`` (n_mv,) are the MVs out of use, by operators' word or the plant's, ``held`` (n_mv,) what is commanded
+        of these now; None: nothing is.
+        """
         sample = readings.sample
         self._before = tuple(self._past) if self.successor is not None else ()
-        more = _inputs(self.controller, readings, self._bridging.used(self.operate, readings))
+        used = self.mv_entries.told(self._bridging.used(self.operate, readings), out, held, self._given)
+        more = _inputs(self.controller, readings, used)
         more |= _known(self.controller, self.courses, sp, sample)
         given = {"sp": sp, "dv": sample.dv, "mv_applied": applied, "state": self._state, **more}
         step = self.controller.step(**given)
@@ -347,19 +370,23 @@ class ActiveController:
         self.stepped = LawInputs(values, self._bridging.unread_s)
         if self._past.maxlen:
             self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
-        self._state = step.state
+        self._state, self._given = step.state, np.array(step.mv)  # the host gets step.mv, may write into it
         return step
 
-    def beside(self, sample: Sample, sp: Array, applied: Array) -> Array | None:
+    def beside(
+        self, sample: Sample, sp: Array, applied: Array, away: Those | None = None, held: Array | None = None
+    ) -> Array | None:
         """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
         new = self.successor
         if new is None:
             return None
-        new.step(sample, sp, applied, self._before, self.wishes, self.courses)
+        new.step(sample, sp, applied, self._before, self.wishes, self.courses, away, held)
         if new.ready:
             self.replaced, self.successor = self.controller, None
             self.controller, self._state, self.stepped = new.controller, new.state, None
+            self._given = new.mv
             self.operating, self.operate, self._bridging = new.operating, new.operate, new.bridging
+            self.mv_entries = new.mv_entries
             if self._made is not None:
                 self.guards = tuple(new.guards)
                 self._past = deque(self._past, maxlen=_longest(self.guards))
@@ -386,7 +413,7 @@ class ActiveController:
 
     def begin_cold(self, reason: str) -> None:
         """The laws know nothing of what was."""
-        self._state = self.controller.cold_state()
+        self._state, self._given = self.controller.cold_state(), None
         if self.successor is not None:
             self.successor.miss(reason)
 

@@ -16,8 +16,9 @@ from loopwright.serving.controller import Controller
 from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Guard, Sample, default_guards, reworded
-from loopwright.serving.modes import ByHand, Command, Fallback, LoopMode, Mode, Transfer, mode_of
+from loopwright.serving.modes import Command, Fallback, LoopMode, Mode, Transfer, mode_of
 from loopwright.serving.mv_readback import AppliedMV
+from loopwright.serving.mvs.out_of_use import OutOfUse
 from loopwright.serving.preview.course import Courses, Points
 from loopwright.serving.ranges import within
 from loopwright.serving.scan_grid import RunReport, run_on_grid
@@ -38,12 +39,11 @@ class ControlLoop:
     nothing: the law is stepped on what others do with the plant. A fault in AUTO changes the mode to
     HOLD, and the command names the reason; ``recover_after`` good samples change it back. A fault that
     lasts is for ``fallback``. After a gap the law starts cold (state = 0). A law that reads ``fresh`` goes on without a
-    PV whose reading alone is bad; the command names it.
+    PV whose reading alone is bad; the command names it. One with ``use`` of an MV goes on without that MV, where an
+    operator has it in hand or the plant has it itself, see ``loopwright.serving.mvs``.
 
-    A command that did not reach the plant (``unwritten``) leaves it unknown where the MV stands: others may move it
-    meanwhile. The next read-back tells, also that of a sample which is refused for another reason. HOLD, MANUAL and
-    the fallback go on from there, and nothing writes an old MV over it. Nothing is written while the read-back is bad,
-    nor, where the MV stands outside its range, until it is back. A plant that reads nothing back gets the old MV.
+    After a command that did not reach the plant (``unwritten``), HOLD, MANUAL and the fallback go on from where the MV
+    stands, see ``loopwright.serving.mv_readback.AppliedMV``.
 
     Every written MV lies in its range, in every mode and with any guards; a discrete MV has one of its values. An MV
     moves by at most its ``max_move`` a period: a law that gives more has a fault, the fallback and an operator's MV
@@ -84,6 +84,8 @@ class ControlLoop:
     bridge_s, critical
         Time for which the bad reading of a PV is bridged [s], ten periods unless given, and the names of PVs without
         which the loop holds after it. See ``loopwright.serving.bridging``.
+    local_s
+        Time for which an MV may be elsewhere than it was commanded [s], see ``loopwright.serving.mvs.local_mvs``.
 
     Raises
     ------
@@ -109,6 +111,7 @@ class ControlLoop:
         operate: Mapping[str, float] | None = None,
         bridge_s: float | None = None,
         critical: Sequence[str] = (),
+        local_s: float | None = None,
     ) -> None:
         mode = mode_of(mode)
         if recover_after is not None and recover_after < 1:
@@ -118,6 +121,7 @@ class ControlLoop:
         manifest = controller.manifest
         guards = default_guards if guards is None else guards
         self._active = ActiveController(controller, guards, bridge_s=bridge_s, critical=critical)
+        self._out = OutOfUse(manifest.mv, manifest.period_s, local_s)
         if operate:
             self.set_operate(operate)
         self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
@@ -140,7 +144,6 @@ class ControlLoop:
         self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
-        self._hand = ByHand()
 
     # ------------------------------------------------------------------ who is in charge
     @property
@@ -199,7 +202,12 @@ class ControlLoop:
     @property
     def mv_wanted(self) -> Array:
         """Where the MV goes by hand, shape (n_mv,); the last commanded one where it is there."""
-        return self._mv.copy() if self._hand.wanted is None else self._hand.wanted.copy()
+        return self._out.hand.goal(self._mv)
+
+    @property
+    def local(self) -> dict[str, str]:
+        """The MVs that the plant has itself, each with the reason."""
+        return dict(self._out.local.why)
 
     @property
     def fault(self) -> str:
@@ -209,17 +217,15 @@ class ControlLoop:
     def set_mode(self, mode: Mode) -> None:
         """Set the mode, as a Mode or its name; it takes effect at the next scan.
 
-        LoopError for another word, and where a shadow that knows no good sample now is to move the plant: where the MV
-        stands is not known.
+        LoopError for another word, and where a shadow that has no good sample now is to move the plant.
         """
         mode = mode_of(mode)
         if self.mode is Mode.SHADOW and mode is not Mode.SHADOW and self._refused_why:
-            raise LoopError(
-                f"the last sample was refused ({self._refused_why}): where the MV stands is not known; wait"
-            )
+            why = f"the last sample was refused ({self._refused_why})"
+            raise LoopError(f"{why}: where the MV stands is not known; wait")
         if mode is not self.mode:
             self._transfer.begin()
-            self._hand.wanted = None
+            self._out.begun(mode, self._active.in_hand)
         self._mode.set(mode)
 
     def set_sp(self, sp: ArrayLike) -> tuple[str, ...]:
@@ -260,22 +266,27 @@ class ControlLoop:
         ``operate``, an unknown name, and a value that is not allowed; then nothing is changed.
         """
         self._active.set_operate(values)
+        self._out.operated(values)
 
     def operate_with(self, values: Mapping[str, float]) -> Array:
         """``operate`` (n_operate,) as ``set_operate`` would leave it; LoopError where that would refuse."""
         return self._active.operate_with(values)
 
     def set_mv(self, mv: ArrayLike) -> None:
-        """Set the MV (n_mv,) in MANUAL; one with a ``max_move`` goes there scan by scan, see ``mv_wanted``.
+        """Set the MV (n_mv,) by hand; one with a ``max_move`` goes there scan by scan, see ``mv_wanted``.
 
-        LoopError outside its range, in another mode, and after a command that did not reach the plant, until it is
-        known where the MV stands.
+        LoopError outside its range, for a change that ``require_in_hand`` refuses, and until it is known where the MV
+        stands after a command that did not reach the plant.
         """
-        if self.mode is not Mode.MANUAL:
-            raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self.mode}")
+        wanted = within(mv, self.controller.manifest.mv, "MV")
+        self.require_in_hand(self._out.others(self._mv, wanted))
         if self._applied.lost:
             raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
-        self._mv = self._hand.sent(self._mv, within(mv, self.controller.manifest.mv, "MV"), self.controller.manifest.mv)
+        self._mv = self._out.hand.sent(self._mv, wanted, self.controller.manifest.mv)
+
+    def require_in_hand(self, names: Collection[str]) -> None:
+        """LoopError unless operators have these MVs in hand: all in MANUAL, those of ``use`` 0 in AUTO and HOLD."""
+        self._out.require(names, self.mode, self._active.mv_entries, self._active.operate)
 
     def hand_back(self) -> None:
         """The plant is with its own controller now: this loop writes no more, until the mode is set again."""
@@ -285,10 +296,11 @@ class ControlLoop:
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         self._sp = self.courses.followed(self._sp)
-        readings = self._active.look(sample)
+        sample = self._out.look(sample, self._active.mv_entries, lost=self._applied.lost)
+        readings = self._active.look(sample, self._out.local.why)
         reason, self._refused_why = readings.reason, ""
         self._applied.arrived()
-        shown = self._applied.look(sample, self._mv, refused=bool(reason))
+        shown = self._applied.look(sample, self._mv, refused=bool(reason), theirs=self._out.local.away)
         self.found = shown.found
         if shown.silent:
             if shown.outside:
@@ -297,7 +309,8 @@ class ControlLoop:
             both = shown.silent if doubled else reworded(reason, f"{reason}; {shown.silent}")
             return self._without_sample(both, silent=True)
         if self.found is not None:
-            self._mv, self._hand.wanted = self.found.copy(), None
+            self._mv, self._out.hand.wanted = self.found.copy(), None
+        self._mv = self._out.follow(self._mv, shown.applied, self._applied, self.mode, self._active.in_hand)
         if reason:
             return self._without_sample(reason)
         applied = self._mv if shown.applied is None else shown.applied
@@ -308,27 +321,28 @@ class ControlLoop:
                 applied = self._applied.read_back(sample, self._mv)
             if isnan(self._mv[0]):
                 self._mv = applied.copy()
-            step = self._active.step(readings, self._sp, applied)
+            self._mv = self._out.hand.toward(self._mv, self.controller.manifest.mv)
+            held = None if self.mode is Mode.SHADOW else self._mv
+            step = self._active.step(readings, self._sp, applied, self._out.those, held)
         except Exception as error:  # the plant needs an MV after any error
             if self.mode in {Mode.AUTO, Mode.SHADOW}:
-                self._mv = applied
-            return self._without_sample(first_line(error))
+                self._mv = self._out.without(self._mv, applied)
+            return self._without_sample(first_line(error), by_hand=False)
         # Once it was asked, the plant's own controller may have the plant already.
         if self.fault and not self._handing_back() and self._mode.recovers(self.recover_after):
             self.set_mode(Mode.AUTO)
         if self.mode is Mode.AUTO:
-            self._mv = np.array(self._transfer.limited(step.mv, applied))  # the host gets step.mv, may write into it
+            self._mv = self._out.without(self._mv, self._transfer.limited(step.mv, applied))
         elif self.mode is Mode.SHADOW:
             self._mv = applied.copy()
-        self._mv = self._hand.toward(self._mv, self.controller.manifest.mv)
         before = self.controller
-        beside = self._active.beside(readings.sample, self._sp, applied)
+        beside = self._active.beside(readings.sample, self._sp, applied, self._out.local.away, held)
         if self.controller is not before:
             self._transfer.begin()
         self._lasting()
         command = self._command(step.mv, step.info, self.fault, beside)
-        bad = readings.bridged or readings.shed
-        return replace(command, bridged=readings.bridged, shed=readings.shed) if bad else command
+        good = not (readings.bridged or readings.shed)
+        return command if good else replace(command, bridged=readings.bridged, shed=readings.shed)
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
@@ -338,10 +352,11 @@ class ControlLoop:
         self._active.missed(1)
         return self._without_sample(reason)
 
-    def _without_sample(self, reason: str, *, silent: bool = False) -> Command:
+    def _without_sample(self, reason: str, *, silent: bool = False, by_hand: bool = True) -> Command:
         self._refused_why = reason = reason or "a fault without a reason"
         self._lose(reason)
-        self._mv = self._mv if silent else self._hand.toward(self._mv, self.controller.manifest.mv)
+        if by_hand and not silent:
+            self._mv = self._out.hand.toward(self._mv, self.controller.manifest.mv)
         self._lasting(moves=not silent)
         command = self._command(None, None, reason)
         return replace(command, mv=np.full(len(self._mv), nan)) if silent else command
@@ -351,7 +366,7 @@ class ControlLoop:
 
         Where the scan has found that the MV stands elsewhere, it stays there.
         """
-        if self.mode is not Mode.MANUAL or self._hand.wanted is not None:
+        if self.mode is not Mode.MANUAL or self._out.hand.wanted is not None:
             self._mv = np.array(before if self.found is None else self.found, dtype=np.float64)
         self._applied.lose()
         self._lose(reason)
@@ -376,7 +391,8 @@ class ControlLoop:
         """Count the scans of a fault, and go where the fallback says once it has lasted."""
         self._mode.hold()
         if moves and self.fallback is not None and self._mode.overdue(self.fallback, self.manifest.period_s):
-            self._mv = self.fallback.toward(self._mv, self.controller.manifest.mv, self.manifest.period_s)
+            safe = self.fallback.toward(self._mv, self.controller.manifest.mv, self.manifest.period_s)
+            self._mv = self._out.without(self._mv, safe)
 
     def _handing_back(self) -> bool:
         return self._mode.handing_back(self.fallback, self.manifest.period_s)
@@ -386,8 +402,9 @@ class ControlLoop:
         self.courses.over()
         self.courses.passed(1)
         back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
-        command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back)
+        command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back, local=self.local)
         self._applied.command(self._mv, written=command.writes)
+        self._out.local.commanded(self._mv, written=command.writes)
         return command
 
     # ------------------------------------------------------------------ running
@@ -402,20 +419,8 @@ class ControlLoop:
     ) -> RunReport:
         """Scan once a period for ``n`` periods, or until ``until`` returns True after a scan, or ``stop`` before one.
 
-        Deadlines are t0 + k period, so lateness does not add up to drift. A period that has passed
-        completely is skipped and counted. ``before(k)`` is called before the scan at grid place k
-        (for a schedule of set points), ``observe`` after it.
-
-        Only KeyboardInterrupt, SystemExit and similar exceptions end the run, because the plant
-        needs an MV at every period. The effect of another exception depends on its source.
-
-        - ``endpoint``: a fault. The loop goes to HOLD and tries again.
-        - ``before``: a fault, because the set points may be wrong. The held MV is written.
-        - ``clock``: a fault, because the law's period is not known. The held MV is written, and the
-          machine's clock measures the next period.
-        - ``observe``, ``until``, ``stop``, the warm-up: no fault, because the MV is already written
-          or does not depend on them. The run continues; an ``until`` or ``stop`` that raises counts
-          as False. The report counts and names these exceptions, and the first of each is logged at once.
+        ``before(k)`` is called before the scan at grid place k (for a schedule of set points), ``observe`` after it.
+        ``loopwright.serving.scan_grid.run_on_grid`` says what happens where one of them, or the endpoint, raises.
 
         Raises
         ------

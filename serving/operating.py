@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopwright.serving.errors import ContractError
 from loopwright.serving.fields import nearest, shown
 from loopwright.serving.manifest import SWITCHES, OperateEntry
-from loopwright.serving.ranges import numbers
+from loopwright.serving.ranges import is_truth, numbers
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -27,6 +27,7 @@ class Operate:
         self._switches = np.array([e.what in SWITCHES for e in self.entries], dtype=bool)
         pairs = [(i, self.places[f"{e.signal}.high"]) for i, e in enumerate(self.entries) if e.what == "low"]
         self._pairs = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+        self._right = b""  # the values that were found right last: a loop gives the same ones scan by scan
 
     def with_values(self, values: Mapping[str, float], base: ArrayLike | None = None) -> Array:
         """``base`` (the defaults) with some values by name; ContractError for an unknown name or a wrong value."""
@@ -35,7 +36,7 @@ class Operate:
             if name not in self.places:
                 raise _wrong(str(name), f"operate has no entry {shown(name)}{nearest(name, self.places)}")
             try:
-                number = numbers(value)
+                number = numbers(float(value) if self._switches[self.places[name]] and is_truth(value) else value)
             except TypeError as error:
                 raise _wrong(name, f"operate: {name} {error}; it needs a number") from error
             if number.shape:
@@ -54,9 +55,17 @@ class Operate:
         """``values`` as float64 (n,); ContractError with the name of the first that is wrong.
 
         A value must be finite and within its engineered range, a switch 0 or 1, and a low end at most the high one.
+        The values that were found right last are not looked at again.
         """
+        if isinstance(values, np.ndarray) and values.dtype == np.float64 and values.tobytes() == self._right:
+            return values
+        found = self._checked(values)
+        self._right = found.tobytes()
+        return found
+
+    def _checked(self, values: ArrayLike) -> Array:
         try:
-            given = np.asarray(numbers(values), dtype=np.float64)
+            given = np.asarray(numbers(self._unswitched(values)), dtype=np.float64)
         except TypeError as error:
             raise ContractError(f"operate {error}; it needs {len(self.entries)} numbers") from error
         if given.shape != self.default.shape:
@@ -77,6 +86,12 @@ class Operate:
                 f"{given[high]:g}; a low end must not be above the high one",
             )
         return given
+
+    def _unswitched(self, values: Any) -> Any:
+        """``values`` with True and False as 1 and 0 where a switch stands; there, they are its own words."""
+        if not isinstance(values, list | tuple) or len(values) != len(self.entries):
+            return values
+        return [float(v) if is_truth(v) and s else v for v, s in zip(values, self._switches.tolist(), strict=True)]
 
     def ordered(self, values: ArrayLike) -> Array:
         """``values`` (n,) within their ranges, both ends exchanged where the low one is above the high one."""

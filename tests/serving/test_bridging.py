@@ -144,7 +144,7 @@ def test_a_pv_that_was_never_read_is_not_bridged(operated: Controller) -> None:
     [
         sample(fault="the plant's watchdog stands"),
         sample(age_s=5.0),
-        sample(valve=NAN),
+        sample(mv_applied=np.array([40.0, NAN])),  # an MV that this law cannot do without
         sample(mv_applied=np.array([40.0])),
         sample(pv=np.array([300.0, 5.0])),
         sample(bad_pv=("bad",)),
@@ -218,7 +218,7 @@ def test_a_jump_is_not_forgotten_over_a_fault_of_the_whole_sample(operated: Cont
     loop = rated(operated)
     loop.scan(sample())
     assert loop.scan(sample(t=380.0)).bridged
-    assert loop.scan(sample(t=380.0, valve=NAN)).mode is Mode.HOLD
+    assert loop.scan(sample(t=380.0, mv_applied=np.array([40.0, NAN]))).mode is Mode.HOLD
     loop.miss("the plant cannot be read")
     assert list(loop.scan(sample(t=380.0)).bridged) == ["T"]
     assert not loop.scan(sample(t=310.0)).bridged
