@@ -87,11 +87,17 @@ def mv_travel_from(mv: ArrayLike, mv0: ArrayLike) -> Array:
     return np.asarray(np.sum(np.abs(np.diff(u, axis=0, prepend=start[None])), axis=0), dtype=np.float64)
 
 
-def share_clamped(mv: ArrayLike, low: ArrayLike, high: ArrayLike) -> float:
-    """Share of the samples, 0 to 1, at which an MV (n,) stands at one of its operators' limits."""
+def share_clamped(
+    mv: ArrayLike, low: ArrayLike, high: ArrayLike, engineered: tuple[float, float] = (-math.inf, math.inf)
+) -> float:
+    """Share of the samples, 0 to 1, at which an MV (n,) stands at one of its operators' limits.
+
+    An end that is also one of the ``engineered`` range is no operator's, and does not count.
+    """
     u, bottom, top = (np.asarray(of, dtype=np.float64) for of in (mv, low, high))
     near = AT_A_LIMIT * np.maximum(top - bottom, np.finfo(np.float64).tiny)
-    return float(np.mean(_filled(np.asarray((u <= bottom + near) | (u >= top - near), dtype=np.float64))))
+    at_low, at_high = (u <= bottom + near) & (bottom > engineered[0]), (u >= top - near) & (top < engineered[1])
+    return float(np.mean(_filled(np.asarray(at_low | at_high, dtype=np.float64))))
 
 
 def rest_miss(mv: ArrayLike, rest: float, last: int) -> float:

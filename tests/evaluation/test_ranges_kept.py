@@ -79,6 +79,7 @@ def test_travel_counts_the_first_move_too():
 def test_an_mv_at_an_operators_limit_is_clamped_there():
     assert share_clamped([20.0, 30.0, 60.0, 60.0], 20.0, 60.0) == pytest.approx(3 / 4)
     assert share_clamped([40.0, 40.0], 40.0, 40.0) == 1.0
+    assert share_clamped([20.0, 30.0, 60.0, 60.0], 20.0, 60.0, engineered=(0.0, 60.0)) == pytest.approx(1 / 4)
 
 
 def test_the_resting_value_counts_at_the_end():
