@@ -21,7 +21,7 @@ from loopwright.pipeline.evaluation.operated import OperatedLimits
 from loopwright.pipeline.simulation.operator_changes import OperatorChange
 from loopwright.pipeline.simulation.rests import courses
 from loopwright.pipeline.simulation.scenario import Scenario
-from loopwright.serving.manifest import OperateEntry
+from loopwright.serving.manifest import OperateEntry, Signal
 
 CHANGE_AT = LOAD_AT  # sample at which operators change something: the law has begun by then
 LEAST_SAMPLES = 300  # of a test with costs or resting values, which move MVs slowly: 100 to 200 samples and a rest
@@ -122,7 +122,8 @@ class _Made:
         self.pvs = [s for s in case.plant.pv_signals if f"{s.name}.low" in self.places]
         visited = np.quantile(case.record.pv[:, :outputs], VISITED_CV, axis=0)
         self.visited = visited[1] - visited[0]
-        self.half = np.maximum(HALF_WIDTH * self.visited, NOISES_WIDE * case.noise_std[:outputs])
+        self.least_half = NOISES_WIDE * case.noise_std[:outputs]
+        self.half = np.maximum(HALF_WIDTH * self.visited, self.least_half)
 
     def tests(self) -> dict[str, tuple[Scenario, ...]]:
         """Name -> the test on each model; those that a plant does not allow are left out."""
@@ -170,18 +171,20 @@ class _Made:
         """A cost on each MV, as much for a range of each; the PVs have room within ranges."""
         y0 = plant.measure(plant.start[0])
         values = self._ranges(range(len(self.pvs)), y0, np.maximum(ROOM_TO_EARN * self.visited, self.half))
-        values |= {f"{s.name}.cost": float(f"{100 / (s.high - s.low):.3g}") for s in self.mvs}
-        title = f"Costs put in, of {self._cost_words}; process variables have ranges in place of set points"
+        values |= {f"{s.name}.cost": self._cost(s) for s in self.mvs}
+        title = f"Costs put in, {self._cost_words}; process variables have ranges in place of set points"
         n = max(3 * self.reach.hold, LEAST_SAMPLES)
         return self._test("costs", title, plant, [(CHANGE_AT, values)], n)
 
     @property
     def _cost_words(self) -> str:
-        return ", ".join(
-            f"{float(f'{100 / (s.high - s.low):.3g}'):g} a period and {s.unit if s.unit not in ('', '-') else 'unit'} "
-            f"of {s.name}"
-            for s in self.mvs
-        )
+        each = [f"{self._cost(s):g} for {s.name}" for s in self.mvs]
+        return f"{', '.join(each)}, per unit and period"
+
+    @staticmethod
+    def _cost(mv: Signal) -> float:
+        """The cost of a unit of an MV: all of its range costs 100 a period."""
+        return float(f"{100 / (mv.high - mv.low):.3g}")
 
     def pushed(self, plant: OwnPlant) -> Scenario | None:
         """A load that nobody measures pushes a PV out of its range; one without a set point, if there is one."""
@@ -212,7 +215,7 @@ class _Made:
             way = courses(plant, x, moved[None], n)[0, -1] - y0
             for a in settling:
                 for b in settling:
-                    clear = min(abs(way[a]) / self.half[a], abs(way[b]) / self.half[b])
+                    clear = min(abs(way[a]) / self.least_half[a], abs(way[b]) / self.least_half[b])
                     if a != b and (best is None or clear > best[0]):
                         best = clear, j, a, b, way
         if best is None or best[0] < CLEARLY_ODD:
@@ -224,7 +227,7 @@ class _Made:
         values |= {f"{s.name}.use": 0.0 for k, s in enumerate(self.mvs) if k != j}
         values |= {f"{first.name}.{end}": self._within(first.name, end, float(of)) for end, of in ends.items()}
         values |= {f"{first.name}.rank": 1.0, f"{last.name}.rank": 4.0}
-        values |= self._ranges([b], y0, self.half)
+        values |= self._ranges([b], y0, self.least_half)
         title = f"Two ranges at odds, {self.mvs[j].name} alone in use: {first.name} of rank 1, {last.name} of rank 4"
         return self._test("at_odds", title, plant, [(CHANGE_AT, values)], n)
 

@@ -195,10 +195,12 @@ def _mv(j: int, s: Signal, course: OperatedCourse, loop: Trajectory, test: Scena
         clamped = share_clamped(mv[first:], low[first:], high[first:], (s.low, s.high))
     rest = float(wanted[-1]) if rests is not None and wanted is not None and rests[-1] and not out[-1] else None
     miss = None if rest is None else rest_miss(mv, rest, len(mv) - late)
+    travel = float(mv_travel_from(mv, test.mv0[j])[0])
     return MvResult(
         s.name,
         s.unit,
-        float(mv_travel_from(mv, test.mv0[j])[0]),
+        travel,
+        travel / width,
         clamped,
         float(np.max(moves[out])) / width if out.any() else None,
         rest,

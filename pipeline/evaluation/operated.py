@@ -54,13 +54,15 @@ class RangeResult:
 class MvResult:
     """An MV over a test: its travel [unit] with its first move, and the share of time at an operator's limit.
 
-    ``moved_out``: its largest move while it was out of use, in shares of its range; ``rest``: where it should be in the
-    end, and ``miss`` how far it is from there [unit], ``miss_share`` in shares of its range. None where not asked.
+    ``travel_share`` is the travel in widths of its range; ``moved_out``: its largest move while it was out of use, in
+    shares of its range; ``rest``: where it should be in the end, and ``miss`` how far it is from there [unit],
+    ``miss_share`` in shares of its range. None where not asked.
     """
 
     signal: str
     unit: str
     travel: float
+    travel_share: float
     clamped: float
     moved_out: float | None = None
     rest: float | None = None
