@@ -156,14 +156,15 @@ def close_loop(controller: Controller, plant: Simulator, test: Scenario, noise: 
     disturbances = test.disturbances(plant)
     if noise is not None:
         disturbances = disturbances + noise_of_disturbances(plant, test.samples, np.random.default_rng([seed, DV_DRAW]))
-    measured = iter(disturbances)
-    n_info = len(controller.manifest.info)
+    measured, n_info = iter(disturbances), len(controller.manifest.info)
+    operated = test.operated(controller.manifest.operate)
+    asked = None if operated is None else iter(operated.values)
 
     def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, tuple[float, ...]]:
         nonlocal state
-        dv = next(measured)
+        dv, operate = next(measured), None if asked is None else next(asked)
         try:
-            mv, state, info = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=mv_applied, state=state)
+            mv, state, info = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=mv_applied, state=state, operate=operate)
         except LoopwrightError:
             state = controller.cold_state()
             return mv_applied, (*(0.0 for _ in range(n_info)), 1.0)

@@ -14,6 +14,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.cases.operated_trials import try_operated
 from loopwright.pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section, sections
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.errors import LawError
@@ -119,6 +120,12 @@ def validate(name: str) -> None:
     folder.mkdir(parents=True)
     models = read_json(model_folder(params.case, params.model) / "metrics.json") if case.on_models else {}
     metrics = replace(metrics, replay=_replayed(case, models, source, folder / "replay.npz"))
+    operated, loops = try_operated(
+        case, choices.noise_seed, source, choices.operated, f"validate {name}: operators' changes"
+    )
+    if operated:
+        metrics = replace(metrics, operated=operated)
+        np.savez_compressed(folder / "operated.npz", **cast(dict[str, Any], loops))
     if metrics.poor:
         why, _, remedy = metrics.poor.rpartition("; ")
         withheld = f"controllers.{name} {why}, {NOTHING}; {remedy}"
@@ -145,6 +152,8 @@ def validate(name: str) -> None:
         evidence["calmed"] = metrics.calmed
     if metrics.cold_start is not None:
         evidence["cold_start"] = asdict(metrics.cold_start)
+    if operated:
+        evidence["operated"] = {test: result.figures() for test, result in operated.items()}
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
     target = ARTIFACTS / params.case / f"{params.name}.onnx"
