@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import tzinfo
 
@@ -60,8 +60,10 @@ from loopwright.serving.manifest import Signal
 
 
 # ---------------------------------------------------------------------------------- process variables that no MV moves
-def findings_of_answers(pvs: Sequence[str], verdict: RecordJudgement) -> list[Finding]:
-    """One finding for each PV that answers to no MV, and one where not every PV can be controlled.
+def findings_of_answers(
+    pvs: Sequence[str], verdict: RecordJudgement, constraints: Collection[str] = ()
+) -> list[Finding]:
+    """One finding for each PV that answers to no MV, and one where not every PV with a set point can be controlled.
 
     Empty where no PV answers at all: then the verdict says what is wrong with the MVs. ``pvs`` are names, in order.
     """
@@ -70,6 +72,7 @@ def findings_of_answers(pvs: Sequence[str], verdict: RecordJudgement) -> list[Fi
     found = []
     if len(unmoved) < len(pvs):
         found += [Finding("unmoved", n, "answers to no MV: leave its role empty, or make it dv") for n in unmoved]
+    pvs = [name for name in pvs if name not in constraints]
     if len(pvs) > len(mvs):
         first, others = ", ".join(pvs[: len(mvs)]), ", ".join(pvs[len(mvs) :])
         words = (
@@ -186,7 +189,8 @@ def screen_export(
     verdict = with_levels(verdict, excerpt, tags)
     verdict = with_rows_out_of_range(verdict, int(counts[Reason.RANGE]), len(code))
     verdict = with_texts_of_one_side(verdict, findings)
-    findings += findings_of_answers([s.name for s in record.pv_signals], verdict)
+    constraints = {t.name for t in tags if t.constraint}
+    findings += findings_of_answers([s.name for s in record.pv_signals], verdict, constraints)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags
     )

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
+from loopwright.pipeline.config.operator_defaults import MOST_COST, MOST_RANKS
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import hold_numbers
 from loopwright.pipeline.laws.predictive.horizon import Moves
@@ -19,14 +20,12 @@ from loopwright.serving.errors import LoopwrightError
 from loopwright.serving.manifest import Group, OperateEntry, Signal, What
 from loopwright.serving.operating import Operate
 
-MOST_RANKS = 4  # ranks of ranges, 1 kept first; the last one is still dearer than an error
 USUAL_RANK = 3  # rank of a range of which nobody says one: its price is that of a soft limit, and those are solved fast
 # A range's price over the next rank's. On 19 pairs of ranges at odds, on random 3x3 plants with gains from .3 to 2,
 # the higher rank kept 99 % with a ratio of 4 on 11, of 10 on 18, of 30 on all.
 RANK_RATIO = 10.0
 LEAST_FACTOR, MOST_FACTOR = 0.25, 4.0  # of the designed speed and caution
 LEAST_MOVE = 1e-4  # of an MV's range a period: less is `use` 0
-MOST_COST = 1e6  # of a cost per unit: only ratios count
 REST_WEIGHT = 0.01  # of a squared half range away from a resting value, a sample: a set point feels nothing of it
 COST_SLOPE = 0.03  # of the dearest signal, a sample and scaled unit: costs move a set point by .05 % of its range
 TINY_COST = 1e-12  # costs below it are none
