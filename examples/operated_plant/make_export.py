@@ -1,12 +1,12 @@
-"""A day of a mixing tank with two variables and three valves: `python make_export.py FILE.csv` (numpy alone, a fixed seed).
+"""A day of a mixing tank with three valves: `python make_export.py FILE.csv` (numpy alone, a fixed seed).
 
 Hot and cold water are mixed, and an outlet valve lets the mixture go:
 
     A dh/dt = q_hot + q_cold - c_out (outlet / 100) sqrt(h)
     A h dT/dt = q_hot (T_hot - T) + q_cold (T_cold - T) - k (T - T_room)
 
-with h the level [m] and q the flows [m3/s], each its valve's opening times its largest flow. Sampled every 10 s, all three
-valves moved by hand. Two valves would do for two variables; the third is what resting values and costs decide.
+with h the level [m] and q the flows [m3/s], each its valve's opening times its largest flow. Sampled every 10 s, all
+three valves moved by hand. Two valves would do for temperature and level; resting values and costs decide the third.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from loopwright.pipeline.evaluation.metric import with_unit
 from loopwright.pipeline.evaluation.validation import FILE, Validation
 from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.simulation import NOISE_SUFFIX
+from loopwright.serving.controller_file import controller_files
 
 RESULTS_WIDTH = 120  # letters of the table, where no terminal says how wide it is
 REMARK_RATIO = 0.99  # ratio to the bound below which a remark says why
@@ -100,7 +101,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
     # In quotes where a word has to be put in: a shell takes the brackets for something else.
     one = f"{where / best}.onnx" if best is not None else f"'{where / '<law>.onnx'}'"
-    if any(any(standing.folder.glob("*.onnx")) for name, standing in standings.items() if case in (None, name)):
+    if any(controller_files(standing.folder) for name, standing in standings.items() if case in (None, name)):
         console.print(f"try one    loopwright simulate {one}")
         console.print(f"read one   loopwright inspect {one}")
     console.print("registry   make registry, then /#/models in the browser")
@@ -126,7 +127,7 @@ def _beside_the_best(standing: CaseStanding, shipped: Iterable[LawStanding]) -> 
 def without_controller(artifacts: Path, case: str) -> bool:
     """Whether a case has a report and withholds every law, so that its folder in ``artifacts`` has no controller."""
     folder = artifacts / case
-    return (folder / FILE).is_file() and bool(withheld_in(folder)) and not any(folder.glob("*.onnx"))
+    return (folder / FILE).is_file() and bool(withheld_in(folder)) and not controller_files(folder)
 
 
 def _given(params: Path, case: str) -> tuple[str, ...] | None:

@@ -50,6 +50,7 @@ from loopwright.pipeline.stages.paths import (
     validation_folder,
 )
 from loopwright.serving.controller import Controller
+from loopwright.serving.controller_file import controller_files
 
 NOTHING = "so nothing is shipped"
 REMEDY = "give the law other numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
@@ -82,7 +83,7 @@ def validate(name: str) -> None:
         withhold(ARTIFACTS / params.case / f"{params.name}.onnx", why)
         return
     seeds = sorted(
-        int(p.stem.removeprefix("seed")) for p in (design_folder(params.case, params.name) / BASE).glob("*.onnx")
+        int(p.stem.removeprefix("seed")) for p in controller_files(design_folder(params.case, params.name) / BASE)
     )
     if not seeds:
         raise LawError(f"controllers.{name} has no exported files; run its design stage first")

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from loopwright.serving.controller_file import DIGEST_KEY
+from loopwright.serving.controller_file import DIGEST_KEY, EXPLAIN_SUFFIX
 from loopwright.serving.errors import ArtifactError
 from loopwright.serving.manifest import INPUTS, Manifest, strictly
 
-EXPLAIN_SUFFIX = ".explain.onnx"
 EXPLAIN_KEY = "loopwright.explain"
 EXPLAIN_SCHEMA = 1
 CAUSES = frozenset(

@@ -81,7 +81,8 @@ class Explainer:
 
         The courses of CVs have all samples of the horizon, those of MVs the moves of the plan. Raises as ``step`` does.
         """
-        return self._explanation(self._looked(_Given(sp, pv, mv_applied, state, dv, operate, fresh)))
+        given = _Given(sp, pv, mv_applied, state, dv, operate, fresh)
+        return self._explanation(self._looked(given), given)
 
     def what_if(
         self,
@@ -103,24 +104,29 @@ class Explainer:
         allowed; else as ``step``.
         """
         given = _Given(sp, pv, mv_applied, state, dv, operate, fresh)
-        return WhatIf(dict(changes), self._run(given), self._run(self.changed(given, changes)))
+        return WhatIf(dict(changes), self._run(given), self._run(self._changed(given, changes)))
 
-    def changed(self, given: _Given, changes: Mapping[str, float]) -> _Given:
-        """The inputs with ``changes`` by name."""
-        operate = Operate(self.manifest.operate)
-        places = {s.name: i for i, s in enumerate(self.manifest.sp) if s.name not in operate.places}
+    def changed_inputs(
+        self, changes: Mapping[str, float], sp: ArrayLike, operate: ArrayLike | None = None
+    ) -> tuple[Array, Array]:
+        """``sp`` (n_sp,) and ``operate`` (n_operate,) with ``changes`` by name, checked as ``what_if`` does."""
+        entries = Operate(self.manifest.operate)
+        places = {s.name: i for i, s in enumerate(self.manifest.sp) if s.name not in entries.places}
         for name in changes:
-            if name not in places and name not in operate.places:
-                known = (*places, *operate.places)
+            if name not in places and name not in entries.places:
+                known = (*places, *entries.places)
                 raise ContractError(f"what-if: there is no set point or entry {shown(name)}{nearest(name, known)}")
-        sp = np.array(given.sp, dtype=np.float64, ndmin=1)
+        found = np.array(sp, dtype=np.float64, ndmin=1)
         for name, value in changes.items():
             if name in places:
                 i = places[name]
-                sp[i] = within(value, self.manifest.sp[i : i + 1], "what-if's set point")[0]
+                found[i] = within(value, self.manifest.sp[i : i + 1], "what-if's set point")[0]
         others = {name: value for name, value in changes.items() if name not in places}
-        values = operate.with_values(others, given.operate) if operate.entries else given.operate
-        return given._replace(sp=sp, operate=values)
+        return found, entries.with_values(others, operate)
+
+    def _changed(self, given: _Given, changes: Mapping[str, float]) -> _Given:
+        sp, operate = self.changed_inputs(changes, given.sp, given.operate)
+        return given._replace(sp=sp, operate=operate)
 
     # ------------------------------------------------------------------ the graph
     def _looked(self, given: _Given) -> dict[str, Array]:
@@ -141,13 +147,13 @@ class Explainer:
             raise OutputError("the explain graph does not give what the controller does; design the controller again")
         return found
 
-    def _explanation(self, found: Mapping[str, Array]) -> Explanation:
+    def _explanation(self, found: Mapping[str, Array], given: _Given) -> Explanation:
         period_s, explains = self.manifest.period_s, self.explains
         ahead = tuple(period_s * k for k in range(1, explains.horizon + 1))
         starts = tuple(period_s * k for k in explains.starts)
         y = found["y"].reshape(explains.horizon, explains.outputs)
         z = found["z"].reshape(len(explains.starts), len(self.manifest.mv))
-        return Explanation(period_s, self._courses(ahead, y, starts, z), self._moves(found))
+        return Explanation(period_s, self._courses(ahead, y, starts, z), self._moves(found, given))
 
     def _courses(self, ahead: tuple[float, ...], y: Array, starts: tuple[float, ...], z: Array) -> tuple[Course, ...]:
         pvs = self.manifest.pv[: self.explains.outputs]
@@ -157,17 +163,20 @@ class Explainer:
         ]
         return (*cvs, *mvs)
 
-    def _moves(self, found: Mapping[str, Array]) -> tuple[ExplainedMove, ...]:
+    def _moves(self, found: Mapping[str, Array], given: _Given) -> tuple[ExplainedMove, ...]:
         causes, m = self.explains.parts, self.manifest
         names = [s.name for s in (*m.dv, *m.pv[: self.explains.outputs])]
         news = dict(zip(names, found["news"].tolist(), strict=True))
+        entries = Operate(m.operate)
+        operate = entries.default if given.operate is None else np.asarray(given.operate)
+        idle = {e.signal for e, v in zip(m.operate, operate, strict=True) if (e.group, e.what, v) == ("mv", "use", 0)}
         rows = found["parts"].reshape(len(m.mv), len(causes))
         moves = []
         for s, move, row in zip(m.mv, found["move"].tolist(), rows.tolist(), strict=True):
             span = s.high - s.low
             parts = [MovePart(cast("Cause", c), n, v) for (c, n), v in zip(causes, row, strict=True)]
             parts = sorted((p for p in parts if abs(p.value) > ROUNDING * span), key=lambda p: -abs(p.value))
-            parts = parts or [MovePart("plan", "", move)]
+            parts = parts or [MovePart("not_in_use", s.name, move) if s.name in idle else MovePart("plan", "", move)]
             words = sentence_of(move, span, parts, news)
             moves.append(ExplainedMove(s.name, s.unit, move, tuple(parts), words))
         return tuple(moves)
@@ -184,7 +193,8 @@ class Explainer:
             ys.append(found["y"][:outputs])
             mvs.append(found["mv"])
         ahead, starts = (tuple(period_s * (k + i) for k in range(n)) for i in (1, 0))
-        return Explanation(period_s, self._courses(ahead, np.array(ys), starts, np.array(mvs)), self._moves(first))
+        courses = self._courses(ahead, np.array(ys), starts, np.array(mvs))
+        return Explanation(period_s, courses, self._moves(first, given))
 
 
 class _Given(NamedTuple):

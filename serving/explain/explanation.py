@@ -12,6 +12,9 @@ Cause: TypeAlias = Literal[
     "not_in_use", "plan",
 ]  # fmt: skip
 
+HOLDING = frozenset({"mv_low", "mv_high", "max_move", "not_in_use"})  # causes that hold an MV back
+STANDS_STILL = 1e-3  # of its largest part: a smaller move is what two parts leave of each other
+
 
 @dataclass(frozen=True, slots=True)
 class Course:
@@ -55,9 +58,14 @@ class ExplainedMove:
 
     @property
     def first(self) -> MovePart:
-        """The first cause: the largest part in the direction of the move; of an MV that stands, the largest one."""
-        same = [p for p in self.parts if p.value * self.move > 0]
-        return (same or self.parts)[0]
+        """The first cause: the largest part in the direction of the move; of an MV that stands, what holds it there.
+
+        ``plan`` is no cause, and is only named where there is no other.
+        """
+        named = [p for p in self.parts if p.cause != "plan"] or [*self.parts]
+        if abs(self.move) <= STANDS_STILL * abs(self.parts[0].value):
+            return next((p for p in named if p.cause in HOLDING), named[0])
+        return next((p for p in named if p.value * self.move > 0), self.parts[0])
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from loopwright.serving.active_controller import require_fits
-from loopwright.serving.controller_file import file_digest, unseal
+from loopwright.serving.controller_file import controller_files, file_digest, unseal
 from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
 from loopwright.serving.graph.audit import MAX_GRAPH_BYTES, audit
 from loopwright.serving.journal import JournalReader
@@ -47,8 +47,8 @@ def candidates(
     """
     found: list[dict[str, Any]] = []
     now, _, _ = _described(first or in_charge, trusted)
-    beside = (p for p in in_charge.parent.glob("*.onnx") if p.is_file())  # no pipe, which would never end
-    for path in sorted(beside)[:MOST_FILES]:
+    beside = (p for p in controller_files(in_charge.parent) if p.is_file())  # no pipe, which would never end
+    for path in list(beside)[:MOST_FILES]:
         try:
             manifest, sha256, signed = _described(path, trusted)
             require_fits(manifest, now)

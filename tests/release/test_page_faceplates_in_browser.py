@@ -9,9 +9,13 @@ from typing import Any
 
 import pytest
 from chromium import CHROMIUM
+from identified_models import random_model
 from operated_page import TOKEN, ModelPlant, served
 from plant_servers import RunningLoop
+from predictive_loops import law_of
 from processes import within
+
+from loopwright.pipeline.export.explain_graph import export_explanation
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
@@ -24,7 +28,9 @@ Steered = tuple[RunningLoop, ModelPlant]
 
 @pytest.fixture(scope="module")
 def steered(operated_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Steered]:
-    """The loop and its plant."""
+    """The loop and its plant; beside the controller's file lies the graph that explains it."""
+    law = law_of(random_model(3, n_y=2, n_mv=2, n_dv=1), horizon=20, operate={})
+    export_explanation(law, operated_file)
     made = served(operated_file, tmp_path_factory.mktemp("steered"))
     yield made, ModelPlant.made
     made.end()
@@ -216,3 +222,32 @@ def test_a_phone_shows_and_changes_it_without_scrolling_sideways(
     expect(dialog).to_be_hidden()
     assert value(loop, "u0.cost") == (1.5 if scheme == "light" else 0.5)
     phone.close()
+
+
+# ------------------------------------------------------------------------------------------------ why, and what if
+def test_what_the_law_predicts_is_drawn_right_of_now_and_said(page: Page) -> None:
+    for signal, points in (("y0", r"[1-9]\d*"), ("u1", r"[1-9]\d*"), ("d0", "0")):
+        expect(page.locator(f'[data-chart="{signal}"]')).to_have_attribute("data-ahead", re.compile(f"^{points}$"))
+    expect(fact(page, "y0", "expected")).to_contain_text(" in 20 s")
+    expect(fact(page, "u0", "why")).to_contain_text(re.compile(r"stands|%"))
+    expect(fact(page, "law", "missing")).to_be_hidden()
+    page.click("#earlier")  # what is past has no prediction beside it
+    expect(page.locator('[data-chart="y0"]')).to_have_attribute("data-ahead", "0")
+
+
+def test_a_change_is_looked_at_before_it_is_set(page: Page, steered: Steered) -> None:
+    loop, _ = steered
+    events = loop.events()
+    page.click("#change-sp")
+    page.fill('[data-field="y0"]', "1.5")
+    rows = page.locator("#dialog-foreseen tbody tr")
+    expect(rows).to_have_count(4)
+    now, changed = (float(str(text).split(" ")[0]) for text in rows.nth(2).locator("td").all_text_contents())
+    assert rows.nth(2).locator("th").text_content() == "y0"
+    assert abs(changed - 1.5) < abs(now - 1.5)
+    page.click("#cancel")
+    page.click('[data-change="y0"]')
+    page.fill('[data-field="y0.high"]', "-9")
+    expect(page.locator('[id="wrong-y0.high"]')).to_contain_text("y0.high")  # before anybody confirms it
+    page.click("#cancel")
+    assert loop.events() == events

@@ -32,20 +32,21 @@ class ExplainedPredictive(nn.Module):
     """A step of a predictive law with ``operate``, and the parts of its moves.
 
     The last pass minimizes a quadratic cost over the move u = z - z_0 away from where the MVs stand. Let y be the free
-    run with the MVs held, S its slopes, H = S W S' + M the curvature of set points, moves and rests, and W = diag(w).
-    Its minimum has
+    run with the MVs held, S its slopes, W = diag(w) the weights of the set points' errors, V those of the ranges where
+    y leaves them by b, H = S (W + V) S' + M with the curvature M of moves and rests. Its minimum has
 
-        H u = g + l,   g = - S W (y - r) + S f - S c_y - c_z - w_r (z_0 - rest)
+        H u = g + l,   g = - S W (y - r) - S V b + S f - S c_y - c_z - w_r (z_0 - rest)
 
-    f = -p'(b) are the forces of the ranges at the new plan, and l those of the bounds, which are not 0 where a bound
-    holds the plan. Every term of g is a sum of terms of one signal each. For MV j let F be the entries of the plan
-    that no bound holds, and all of its own, and A the others. Then
+    f are the forces at the new plan of ranges that the free run does not leave, and l those of the bounds, which are
+    not 0 where a bound holds the plan. Every term of g is a sum of terms of one signal each. For MV j let F be the
+    entries of the plan that no bound holds, and all of its own, and A the others. Then
 
         H_FF u_F = g_F + l_F - H_FA u_A
 
     and the part of a term in the move of MV j is that term's share in the first entry of it: of l_F what its own limits
-    take, of H_FA u_A what it does because other MVs are at theirs. The sweeps leave a rest, ``plan``: what the plan
-    still has of the last one. So the parts sum to the move.
+    take, of H_FA u_A what it does because other MVs are at theirs. The sweeps do not get to the end of it: what is left
+    is the part ``plan``, as far as the last plan had a move, and beyond that it is spread over the causes by their
+    size. So the parts sum to the move.
 
     The free run is the one that was predicted at the last step, y_0, and what is new since: of each measured
     disturbance its change, of each reading the correction P h (y_m - y_p)/R of state and loads that it makes in the
@@ -118,7 +119,7 @@ class ExplainedPredictive(nn.Module):
         runs, news = self._runs(problem, last, by)
         move = mv - problem.stands
         parts = self._parts(problem, last, by, self._pulls(last, by, runs))
-        parts = self._finished(parts, move, problem.stands).flatten(-2)
+        parts = self._finished(parts, problem, by, move).flatten(-2)
         return Explained(mv, state_next, y.squeeze(-2), z.flatten(-2), move, parts, news)
 
     def _runs(self, problem: PlanProblem, last: LastPass, by: OperatedPlan) -> tuple[list[Tensor], Tensor]:
@@ -153,12 +154,18 @@ class ExplainedPredictive(nn.Module):
         news = torch.cat([self.dv_scale * (measured - held), self.y_scale[: self.n_o] * surprise], dim=-1)
         return [y + moved for y in found], news.squeeze(-2)
 
-    def _pulls(self, last: LastPass, by: OperatedPlan, runs: list[Tensor]) -> Tensor:
-        """The terms (..., K, m) of the minimum, one a part."""
-        ahead = (last.plan - last.before) @ last.run.slopes
-        force = -(last.push.slope + last.push.weight * ahead)  # of the ranges at the new plan
+    def _pulls(self, last: LastPass, by: OperatedPlan, runs: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """The terms (..., K, m) of the minimum, one a part, and the curvature H (..., m, m)."""
         high = last.push.slope > 0
         beyond = [torch.clamp(torch.where(high, y - by.high_inside, by.low_inside - y), min=0.0) for y in runs]
+        # Ranges that the free run leaves pull it back; others hold with the force that they have at the new plan.
+        outside = beyond[-1] > 0
+        bound = torch.where(high, by.high_inside, by.low_inside)
+        ahead = (last.plan - last.before) @ last.run.slopes
+        holding = last.push.slope + last.push.weight * ahead
+        force = -torch.where(outside, last.push.weight * (runs[-1] - bound), holding)
+        weight = last.weight + torch.where(outside, last.push.weight, self.zero)
+        curvature = (last.run.slopes * weight) @ last.run.slopes_t + last.stiff
         grown = [torch.clamp(b - a, min=0.0) for a, b in pairwise(beyond)]
         whole = beyond[0] + sum(grown)
         new = [torch.where(whole > self.tiny, g / torch.maximum(whole, self.tiny), self.zero) for g in grown]
@@ -173,7 +180,7 @@ class ExplainedPredictive(nn.Module):
         ]
         outputs = torch.cat(rows, dim=-2) @ last.run.slopes_t
         moves = [self.of_mv * -by.z_cost, self.of_mv * (by.rest_weight * (by.rest - by.stands))]
-        return torch.cat([outputs, *moves], dim=-2)
+        return torch.cat([outputs, *moves], dim=-2), curvature
 
     def _held(self, problem: PlanProblem, last: LastPass, by: OperatedPlan, rest: Tensor) -> list[Tensor]:
         """Entries (..., 1, m) of the plan that are held: at a low limit, a high one, by speed, and not in use.
@@ -190,36 +197,50 @@ class ExplainedPredictive(nn.Module):
         at_high, at_low = upper & (by.z_high <= high + near), lower & (by.z_low >= low - near)
         return [at_low, at_high, (upper & ~at_high) | (lower & ~at_low), ~used]
 
-    def _parts(self, problem: PlanProblem, last: LastPass, by: OperatedPlan, pulls: Tensor) -> Tensor:
-        """The parts (..., n_mv, K) of the first moves, but for what the sweeps have not finished; scaled."""
-        curvature = (last.run.slopes * last.weight) @ last.run.slopes_t + last.stiff
+    def _parts(self, problem: PlanProblem, last: LastPass, by: OperatedPlan, terms: tuple[Tensor, Tensor]) -> Tensor:
+        """The parts (..., n_mv, K) of the first moves, but for what is left of the last plan; scaled."""
+        pulls, curvature = terms
         moved = last.plan - by.stands
         rest = moved @ curvature - pulls.sum(dim=-2, keepdim=True)
         held = [torch.where(h, self.one, self.zero) for h in self._held(problem, last, by, rest)]
-        free = torch.maximum(1.0 - torch.cat(held, dim=-2).sum(dim=-2, keepdim=True), self.of_mv)  # (..., n_mv, m)
-        inner = free.unsqueeze(-1) * curvature.unsqueeze(-3) * free.unsqueeze(-2)
-        inner = inner + self.unit * (1.0 - free).unsqueeze(-2)
-        first = self.first.unsqueeze(-1)
-        found = torch.cat([inner, first.expand(*inner.shape[:-1], 1)], dim=-1)
-        for p in range(self.law.moves.count):  # Gauss and Jordan: positive definite, so that no row changes its place
-            row = found[..., p : p + 1, :] / found[..., p : p + 1, p : p + 1]
-            found = found - (found[..., p : p + 1] - self.unit[:, p : p + 1]) * row
-        into = (found[..., -1] * free).unsqueeze(-2)  # (..., n_mv, 1, m)
-        own = torch.cat([self.of_mv * (h * rest) for h in held], dim=-2).unsqueeze(-3)
-        others = torch.cat([-(self.of_mv * (h * moved)) @ curvature for h in held], dim=-2).unsqueeze(-3)
-        limits = self.same * own + (1.0 - self.same) * others
+        free = 1.0 - torch.cat(held, dim=-2).sum(dim=-2, keepdim=True)
+        own = torch.cat([self.of_mv * (h * rest) for h in held], dim=-2)
+        others = torch.cat([-(self.of_mv * (h * moved)) @ curvature for h in held], dim=-2)
+        limits = self.same * own.unsqueeze(-3) + (1.0 - self.same) * others.unsqueeze(-3)
+        # Its own bounds are let go, to see what they take; an MV out of use has no part but that.
+        own_too = torch.maximum(free, self.of_mv * (1.0 - held[-1]))  # (..., n_mv, m)
+        into = self._solved(curvature.unsqueeze(-3), own_too.unsqueeze(-1), self.first.unsqueeze(-1)).transpose(-1, -2)
         return torch.cat([(pulls.unsqueeze(-3) * into).sum(dim=-1), (limits * into).sum(dim=-1)], dim=-1)
 
-    def _finished(self, parts: Tensor, move: Tensor, stands: Tensor) -> Tensor:
-        """All parts (..., n_mv, K) [mv] of the moves (..., n_mv), with those of the plan that is not worked off."""
-        law, n_mv = self.law, self.n_mv
+    def _solved(self, curvature: Tensor, free: Tensor, right: Tensor) -> Tensor:
+        """H_FF^-1 times ``right`` (..., m, n) in the rows of F, and 0 in the others; ``free`` (..., m, 1) is 1 in F."""
+        m = self.law.moves.count
+        inner = free * curvature * free.transpose(-1, -2)
+        inner = inner + self.unit * (1.0 - free)
+        found = torch.cat([inner, (right * free).expand(*inner.shape[:-1], right.shape[-1])], dim=-1)
+        for p in range(m):  # Gauss and Jordan: positive definite, so that no row changes its place
+            row = found[..., p : p + 1, :] / found[..., p : p + 1, p : p + 1]
+            found = found - (found[..., p : p + 1] - self.unit[:, p : p + 1]) * row
+        return found[..., m:] * free
+
+    def _finished(self, parts: Tensor, problem: PlanProblem, by: OperatedPlan, move: Tensor) -> Tensor:
+        """All parts (..., n_mv, K) [mv] of the moves (..., n_mv), with those of the last plan.
+
+        The last plan carries over no more than it had planned. What the sweeps miss beyond that is spread over the
+        causes by their size.
+        """
+        law, n_mv, stands = self.law, self.n_mv, problem.stands
         # Where an MV stands outside its range, the step begins at the end of it.
         begins = (torch.minimum(torch.maximum(stands, law.low), law.high) - stands).unsqueeze(-2)
-        outside = torch.cat([torch.clamp(begins, min=0.0), torch.clamp(begins, max=0.0)], dim=-1)
         eye = self.unit[:n_mv, :n_mv]
-        outside = outside * torch.cat([eye, eye], dim=-1)
-        known, at_low, others = torch.split(
+        outside = torch.cat([torch.clamp(begins, min=0.0) * eye, torch.clamp(begins, max=0.0) * eye], dim=-1)
+        known, limits, others = torch.split(
             parts * law.mv_half.unsqueeze(-1), [parts.shape[-1] - 4 * n_mv, 2 * n_mv, 2 * n_mv], dim=-1
         )
-        found = torch.cat([known, at_low + outside, others], dim=-1)
+        found = torch.cat([known, limits + outside, others], dim=-1)
+        left = move.unsqueeze(-1) - found.sum(dim=-1, keepdim=True)
+        most = (law.mv_half * (problem.plan - by.stands)[..., :n_mv].abs()).transpose(-1, -2)
+        spread = left - torch.minimum(torch.maximum(left, -most), most)
+        size = found.abs()
+        found = found + spread * size / torch.maximum(size.sum(dim=-1, keepdim=True), self.tiny)
         return torch.cat([found, move.unsqueeze(-1) - found.sum(dim=-1, keepdim=True)], dim=-1)

@@ -73,7 +73,9 @@ function look() {
     let shown = [];
     wrong(null);
     try {
-      if (Object.keys(values).length) shown = [await mine.foresee(values)].filter(Boolean);
+      const asked = Object.keys(values).length ? mine.foresee(values) : null;
+      if (asked) $("dialog-foreseen").replaceChildren(element("p", { class: "hint" }, "The law is asked what it would do…"));
+      shown = [await asked].filter(Boolean);
     } catch (error) {
       if (mine !== pending) return;
       if (!wrong(error.entry, error.message, false)) shown = [error.message];

@@ -1,11 +1,12 @@
 // What the law predicts and plans, and why it moves; and what it would do after a change. The page's server computes it
 // beside the loop, from the inputs of the loop's last step.
-import { clock, duration, element, figure, number, unit } from "./format.js";
+import { duration, element, figure, number, unit } from "./format.js";
 import { foresee, get } from "./api.js";
 
 const AGAIN_MS = 10_000; // after a refusal: a law that is not stepped yet will be, a file that is missing may come
 const SHARE = 0.4; // of the time that is shown, which the future may have beside it
 const DASH = [5, 4];
+const STANDS = 1e-4; // of an MV's range: a smaller move is none, as the sentence has it
 let found = null; // { time, courses, moves }
 let missing = ""; // why there is none
 let speed = 1;
@@ -60,8 +61,8 @@ export function expected(signal) {
 export function reasons(signal) {
   const m = move(signal);
   if (!m) return "";
-  const by = `${m.move > 0 ? "+" : ""}${figure(m.move)} ${unit(signal)}`.trim();
-  return `${m.sentence} (next move ${by})`;
+  if (Math.abs(m.move) < STANDS * (signal.high - signal.low)) return m.sentence;
+  return `${m.sentence} (next move ${m.move > 0 ? "+" : ""}${figure(m.move)} ${unit(signal)})`.replace(" )", ")");
 }
 
 // The values of a course between two times, for the scale of its chart.
@@ -86,6 +87,7 @@ export function draw(u, signal, kind, color) {
   ctx.textAlign = "left";
   ctx.fillStyle = ctx.strokeStyle = color("ink-2");
   ctx.lineWidth = devicePixelRatio;
+  ctx.setLineDash([]); // uPlot leaves what its last line needed
   ctx.fillText("prediction", begin + 4 * devicePixelRatio, bbox.top - 5 * devicePixelRatio);
   ctx.beginPath();
   ctx.moveTo(begin, bbox.top);
@@ -126,5 +128,3 @@ export async function whatIf(changes, signals) {
     element("tbody", {}, ...rows.map((s) => element("tr", {}, element("th", { scope: "row" }, s.name), cell(s, before), cell(s, after)))),
   );
 }
-
-export const since = () => (found ? clock(found.time) : "");

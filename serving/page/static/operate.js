@@ -185,10 +185,10 @@ export function askChange(group, signal) {
       const now = value(entry.name);
       const written = (v) => (["low", "high", "rest"].includes(entry.what) ? number(v, signal) : figure(v));
       const ends = what === "cost" ? "" : `${figure(entry.low)} … ${figure(entry.high)}`; // of a cost only ratios count
-      const allowed = [entry.unit && `[${entry.unit}]`, ends].filter(Boolean).join(", ");
+      const allowed = [`${label} ${entry.unit && `[${entry.unit}]`}`.trim(), ends].filter(Boolean).join(", ");
       return {
         name: entry.name,
-        label: choices ? label : `${label}, ${allowed}`,
+        label: choices ? label : allowed,
         unit: choices ? "" : entry.unit,
         now: choices ? choices.find(([v]) => v === now)?.[1] : written(now),
         value: choices ? now : Number(written(now)),
