@@ -103,6 +103,25 @@ def test_a_simulation_has_the_operate_that_is_asked_for(
         assert said.count("\n") == 1
 
 
+def test_a_course_is_known_before_it_comes(
+    plant: EquationPlant, pid_file: Path, tmp_path_factory: pytest.TempPathFactory, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The set point follows the file, and the MV of a law that reads it moves before it does."""
+    path, model = tmp_path_factory.mktemp("controllers") / "course.onnx", parts(plant)["identified"]
+    law = Predictive(plant.signals, model, Predictive.Params(horizon=20, preview="course")).eval()
+    export(law, path, case=CASE, provenance={})
+    Path("recipe.csv").write_text("time,C_A\n10,0.6\n15,0.55\n")
+    plain = simulate(path, "--sp", "0.5", "--duration", "20")
+    rows = simulate(path, "--sp", "0.5", "--duration", "20", "--course", "recipe.csv")
+    np.testing.assert_array_equal(column(rows, "SP C_A [mol/l]"), np.repeat([0.5, 0.6, 0.55], [20, 10, 10]))
+    moved = np.abs(column(rows, "T_j [K]") - column(plain, "T_j [K]"))
+    assert moved[:20].max() > 0.1
+    for words in ([str(pid_file), "--course", "recipe.csv"], [str(path), "--straight", "C_A"]):
+        capsys.readouterr()
+        assert main(["simulate", *words, "--sp", "0.5", "--duration", "20"]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_set_points_disturbance_and_manual_happen_when_asked(
     pid_file: Path, plant: EquationPlant, capsys: pytest.CaptureFixture[str]
 ) -> None:
