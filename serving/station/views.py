@@ -125,6 +125,7 @@ def state(station: Station) -> View:
         "operate": list(seen.operate),  # of the names in ``about``
         "bridged": dict(command.bridged),
         "shed": dict(command.shed),
+        "local": dict(command.local),
         "quality": [] if sample is None else [words(status) for status in sample.quality],
         "sha256": seen.controller.sha256,
         "successor": seen.successor,
