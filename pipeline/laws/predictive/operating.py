@@ -26,7 +26,8 @@ USUAL_RANK = 3  # rank of a range of which nobody says one: its price is that of
 RANK_RATIO = 10.0
 LEAST_FACTOR, MOST_FACTOR = 0.25, 4.0  # of the designed speed and caution
 LEAST_MOVE = 1e-4  # of an MV's range a period: less is `use` 0
-# Times the designed weight of a set point: a factor of 10 between two lets one give way, of 100 by nearly all.
+# Times the designed weight of a set point. On random 2x2 plants (seeds 3, 4, 8, 11, 12) with one MV out of use the set
+# point that weighs 10 times the other kept 9 to 35 % of its error, at 100 times 1 to 7 %.
 LEAST_WEIGHT, MOST_WEIGHT = 0.1, 10.0
 MOST_COST = 1e6  # of a cost per unit: only ratios count
 REST_WEIGHT = 0.01  # of a squared half range away from a resting value, a sample: a set point feels nothing of it
