@@ -20,7 +20,7 @@ from loopwright.serving.graph.audit import audit
 from loopwright.serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
 from loopwright.serving.operating import Operate
 from loopwright.serving.preview.differences import Differences
-from loopwright.serving.ranges import numbers
+from loopwright.serving.ranges import numbers, switched
 
 LONGEST_STEP_S = 1.0  # a fork waits no longer for a step
 _locks: WeakSet[Lock] = WeakSet()  # of all controllers of this process
@@ -149,7 +149,8 @@ class Controller:
         ------
         ContractError
             An input has the wrong shape or type, or is missing; an entry of ``operate`` is outside its engineered
-            range, ``fresh`` is neither 0 nor 1, ``ahead`` leaves a signal's range, or the law does not read ``ahead``.
+            range, ``fresh`` is neither 0 nor 1, ``ahead`` leaves a signal's range; the law does not read one of these
+            three that is given.
         SampleError
             An input is not finite: no MV is computed from it.
         OutputError
@@ -240,7 +241,8 @@ class Controller:
         self._out, outs = _vectors([len(m.mv), m.n_state, len(m.info)])
         starts = [(p.ctypes.data - self._out.ctypes.data) // 8 for p in outs]
         self._cuts = (len(m.mv), starts[1], starts[1] + m.n_state, starts[2], starts[2] + len(m.info))
-        self._operate = Operate(m.operate) if "operate" in m.inputs or "fresh" in m.inputs else None
+        self._operate = Operate(m.operate) if "operate" in m.inputs else None
+        self._reads_fresh = "fresh" in m.inputs
         self._all_fresh = np.ones(len(m.pv))
         self._ahead = Differences(m.ahead) if m.ahead is not None and "ahead" in m.inputs else None
         self._ranges = [(s.low, s.high, s.values) for s in m.mv]
@@ -260,11 +262,15 @@ class Controller:
     def _operated(self, operate: ArrayLike | None, fresh: ArrayLike | None) -> tuple[Any, Any]:
         """``operate`` and ``fresh``, checked; their defaults where there are none."""
         if self._operate is None:
-            return None, None
-        operate = self._operate.default if operate is None else self._operate.checked(operate)
+            self._require_none("operate", operate)
+        else:
+            operate = self._operate.default if operate is None else self._operate.checked(operate)
+        if not self._reads_fresh:
+            self._require_none("fresh", fresh)
+            return operate, None
         if fresh is None:
             return operate, self._all_fresh
-        known = self._vector("fresh", fresh, len(self.manifest.pv))
+        known = self._vector("fresh", switched(fresh), len(self.manifest.pv))
         if not ((known == 0) | (known == 1)).all():
             raise ContractError(f"fresh is {known.tolist()}; each is 1 for a new and good reading, or 0")
         return operate, known
@@ -272,16 +278,18 @@ class Controller:
     def _known(self, ahead: ArrayLike | None, sp: ArrayLike, dv: ArrayLike | None) -> Any:
         """``ahead``, checked; zeros where there is none."""
         if self._ahead is None:
-            if ahead is None:
-                return None
-            raise ContractError(
-                f"the law {self.manifest.law!r} does not read ahead; design it with preview: course, or leave ahead out"
-            )
+            self._require_none("ahead", ahead)
+            return None
         if ahead is None:
             return self._ahead.none
         m = self.manifest
         present = [self._vector("sp", sp, len(m.sp)), *([self._vector("dv", dv, len(m.dv))] if m.dv else [])]
         return self._ahead.checked(ahead, np.concatenate(present))
+
+    def _require_none(self, name: str, given: object) -> None:
+        if given is not None:
+            m = self.manifest
+            raise ContractError(f"the law {m.law!r} does not read {name}; its inputs are {', '.join(m.inputs)}")
 
     def _reset(self) -> None:
         """Inputs that any law can be warmed with: the middle of each range, no past."""

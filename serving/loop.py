@@ -52,17 +52,12 @@ class ControlLoop:
 
     Parameters
     ----------
-    controller
-        The law.
-    endpoint
-        Reads and writes the plant; only ``run`` needs it.
-    sp
-        Set points (n_sp,).
+    controller, endpoint
+        The law, and what reads and writes the plant; only ``run`` needs that.
+    sp, mode
+        Set points (n_sp,) and mode at the start.
     mv
-        The MV that the plant has now (n_mv,): the start value of HOLD and MANUAL. None: it is not known. The loop then
-        writes nothing until a good sample has a read-back, and begins from there.
-    mode
-        Mode at the start.
+        The MV that the plant has now (n_mv,). None: it is not known; nothing is written until a good sample tells.
     guards
         Checks that can refuse a sample, or what makes them for a controller's manifest: they are then made anew for
         each controller that takes over. ``default_guards`` unless given.
@@ -267,6 +262,11 @@ class ControlLoop:
         """
         self._active.set_operate(values)
         self._out.operated(values)
+
+    @property
+    def wishes(self) -> dict[str, float]:
+        """The values of ``operate`` that somebody has set since the loop began, by name."""
+        return dict(self._active.wishes)
 
     def operate_with(self, values: Mapping[str, float]) -> Array:
         """``operate`` (n_operate,) as ``set_operate`` would leave it; LoopError where that would refuse."""

@@ -112,11 +112,11 @@ class Signal:
 # ------------------------------------------------------------------------------- what operators change of a running law
 Group: TypeAlias = Literal["cv", "mv", "law"]
 What: TypeAlias = Literal[
-    "use", "track", "low", "high", "rank", "max_move", "rest", "rest_use", "cost", "speed", "caution"
+    "use", "track", "weight", "low", "high", "rank", "max_move", "rest", "rest_use", "cost", "speed", "caution"
 ]
 SWITCHES = frozenset({"use", "track", "rest_use"})
 OF_GROUP: Mapping[str, frozenset[str]] = {
-    "cv": frozenset({"use", "track", "low", "high", "rank", "cost"}),
+    "cv": frozenset({"use", "track", "weight", "low", "high", "rank", "cost"}),
     "mv": frozenset({"use", "low", "high", "max_move", "rest", "rest_use", "cost"}),
     "law": frozenset({"speed", "caution"}),
 }
@@ -128,10 +128,10 @@ class OperateEntry:
 
     ``group`` says of what it is one: a controlled variable (cv), an MV, or the whole law.
 
-    ``use`` 0 takes a signal out; ``track`` 0 leaves a controlled variable alone within ``low`` and ``high``; ``rank``
-    1 keeps its range before 2; ``max_move`` is a period's; ``rest`` is where an MV goes that nothing asks for, where
-    ``rest_use`` is 1; ``cost`` counts per unit of the signal and period, beside those of the other signals; ``speed``
-    and ``caution`` multiply those of the law.
+    ``use`` 0 takes a signal out; ``track`` 0 leaves a controlled variable alone within ``low`` and ``high``; ``weight``
+    multiplies that of its set point: the smaller one gives way; ``rank`` 1 keeps its range before 2; ``max_move`` is a
+    period's; ``rest`` is where an MV goes that nothing asks for, where ``rest_use`` is 1; ``cost`` counts per unit of
+    the signal and period, beside those of the other signals; ``speed`` and ``caution`` multiply those of the law.
     """
 
     group: Group

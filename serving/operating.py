@@ -16,6 +16,16 @@ from loopwright.serving.ranges import is_truth, numbers
 Array: TypeAlias = NDArray[np.float64]
 
 
+def allowed(entry: OperateEntry) -> str:
+    """The values that an entry may have, in words."""
+    if entry.low == entry.high:
+        return f"{entry.low:g} alone"
+    return "0 or 1" if entry.what in SWITCHES else f"{entry.low:g} to {entry.high:g} {entry.unit}".rstrip()
+
+
+SWITCHED_ON = 0.85  # of drawn switches: with half of them off laws would mostly stand still
+
+
 class Operate:
     """The entries of a law's ``operate``: defaults, values by name, and what is wrong with some."""
 
@@ -74,9 +84,7 @@ class Operate:
         if not good.all():
             i = int(np.argmin(good))
             e = self.entries[i]
-            switched = self._switches[i] and e.low < e.high
-            allowed = "0 or 1" if switched else f"{e.low:g} to {e.high:g} {e.unit}".rstrip()
-            raise _wrong(e.name, f"operate: {e.name} is {given[i]:g}; allowed is {allowed}")
+            raise _wrong(e.name, f"operate: {e.name} is {given[i]:g}; allowed is {allowed(e)}")
         crossed = given[self._pairs[:, 0]] > given[self._pairs[:, 1]]
         if crossed.any():
             low, high = (int(k) for k in self._pairs[int(np.argmax(crossed))])
@@ -92,6 +100,20 @@ class Operate:
         if not isinstance(values, list | tuple) or len(values) != len(self.entries):
             return values
         return [float(v) if is_truth(v) and s else v for v, s in zip(values, self._switches.tolist(), strict=True)]
+
+    def drawn(self, rng: np.random.Generator, share: float = 1.0) -> Array:
+        """Random values (n,) that are allowed: a ``share`` of the entries anywhere in their ranges, others by default.
+
+        Switches are 0 or 1, ranks whole, and no low end is above its high one.
+        """
+        found = self.default.copy()
+        for i, e in enumerate(self.entries):
+            if rng.uniform() < share:
+                value = rng.uniform(e.low, e.high)
+                found[i] = round(value) if e.what == "rank" else value
+                if e.what in SWITCHES:
+                    found[i] = e.high if rng.uniform() < SWITCHED_ON else e.low
+        return self.ordered(found)
 
     def ordered(self, values: ArrayLike) -> Array:
         """``values`` (n,) within their ranges, both ends exchanged where the low one is above the high one."""

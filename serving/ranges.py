@@ -40,6 +40,14 @@ def is_truth(value: object) -> bool:
     return type(value) is bool or getattr(getattr(value, "dtype", None), "kind", "") == "b"
 
 
+def switched(given: object) -> object:
+    """``given`` with truth values as 1 and 0: they are the words of a switch."""
+    kind = getattr(getattr(given, "dtype", None), "kind", "")
+    if kind == "b":
+        return np.asarray(given, dtype=np.float64)
+    return [float(v) if is_truth(v) else v for v in given] if isinstance(given, list | tuple) else given
+
+
 def within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:
     """``values`` as (n,); LoopError outside the signals' ranges."""
     try:

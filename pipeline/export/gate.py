@@ -20,7 +20,7 @@ from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopwrightError
-from loopwright.serving.manifest import INPUTS, SENSITIVE, SWITCHES, Manifest, Signal
+from loopwright.serving.manifest import INPUTS, SENSITIVE, Manifest, Signal
 from loopwright.serving.operating import Operate
 from loopwright.serving.preview.ahead import Ahead
 from loopwright.serving.preview.differences import Differences
@@ -261,7 +261,6 @@ def _course(signals: Sequence[Signal], rng: np.random.Generator, jumps: float | 
 
 
 OPERATED = 1 / 25  # probability a step that an operator changes something
-SWITCHED_ON = 0.85  # of switches that are on
 NOT_FRESH = 0.1  # of readings that are not fresh
 
 
@@ -272,13 +271,7 @@ def _operated(operate: Operate, rng: np.random.Generator) -> Callable[[], Array]
     def step() -> Array:
         nonlocal at
         if rng.uniform() < OPERATED:
-            at = np.array([rng.uniform(e.low, e.high) for e in operate.entries])
-            for i, e in enumerate(operate.entries):
-                if e.what in SWITCHES:
-                    at[i] = float(rng.uniform() < SWITCHED_ON) * e.high
-                elif e.what == "rank":
-                    at[i] = round(at[i])
-            at = operate.ordered(at)
+            at = operate.drawn(rng)
         return at
 
     return step

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from loopwright.serving.controller import Controller, Step
 from loopwright.serving.errors import OutputError, SampleError
-from loopwright.serving.manifest import SWITCHES, Manifest, Signal
+from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.operating import Operate
 from loopwright.serving.preview.ahead import Ahead
 from loopwright.serving.preview.differences import Differences
@@ -195,7 +195,7 @@ class _Steering:
         if self.at is None:
             self.at = np.array(self.manifest.usual("operate"))
         elif given.part in WITHOUT_PAST or self.rng.uniform() < STEERED_ANEW:
-            self.at = self._drawn()
+            self.at = Operate(self.manifest.operate).drawn(self.rng, STEERED)
         fresh = (self.rng.uniform(size=len(self.manifest.pv)) >= UNFRESH).astype(np.float64)
         values = {"operate": self.at, "fresh": fresh}
         return replace(given, inputs=given.inputs | {n: v for n, v in values.items() if n in self.manifest.inputs})
@@ -210,15 +210,6 @@ class _Steering:
         share = np.where(rng.uniform(size=n) < STEPPED, at >= begin, at / ahead.horizon)
         change = share * (target - present) * (rng.uniform() >= NOTHING_TO_COME)
         return Differences(ahead).within(change, present)
-
-    def _drawn(self) -> Array:
-        """Values within the engineered ranges: switches 0 or 1, ranks whole, no low end above its high one."""
-        found = np.array(self.manifest.usual("operate"))
-        for i, e in enumerate(self.manifest.operate):
-            if self.rng.uniform() < STEERED:
-                whole = e.what in SWITCHES or e.what == "rank"
-                found[i] = self.rng.integers(int(e.low), int(e.high) + 1) if whole else self.rng.uniform(e.low, e.high)
-        return Operate(self.manifest.operate).ordered(found)
 
 
 def _anywhere(rng: np.random.Generator, signals: tuple[Signal, ...]) -> Array:

@@ -61,7 +61,8 @@ class Differences:
             return False
         rows = values.reshape(self.ahead.horizon, -1)
         least, most = (rows.min(axis=0) + present).tolist(), (rows.max(axis=0) + present).tolist()
-        return all(s.low <= low and high <= s.high for s, low, high in zip(self.ahead.signals, least, most, strict=True))
+        ends = zip(self.ahead.signals, least, most, strict=True)
+        return all(s.low <= low and high <= s.high for s, low, high in ends)
 
     def allowed(self, given: Array, present: Array) -> NDArray[np.bool_]:
         """Whether each difference (..., N n) may be given beside the present values (..., n)."""

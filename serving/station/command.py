@@ -80,7 +80,7 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
             help="let a controller into AUTO although its file does not prove it",
         )
     operate = "what operators may change of the law: ranges, uses, limits"
-    for name, words in (("sp", "set points"), ("mv", "MVs, in MANUAL"), ("operate", operate)):
+    for name, words in (("sp", "set points"), ("mv", "MVs by hand, in MANUAL or out of use"), ("operate", operate)):
         values = commands.add_parser(name, help=f"change {words}")
         values.add_argument("values", metavar="NAME=VALUE", nargs="+", help="of one or more signals, in their units")
     course = commands.add_parser("course", help="give set points and forecasts of disturbances to come, or end them")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
 from math import ceil, nan
 from typing import TypeAlias
@@ -34,6 +34,7 @@ class Recorder:
         self._controller: Controller | None = None
         self._fault, self._trial, self._mode = "", "", ""
         self._bad: dict[str, bool] = {}  # PVs that were bridged, or left out (True)
+        self._local: Mapping[str, str] = {}  # MVs that the plant had itself
 
     @property
     def controller(self) -> Controller:
@@ -88,6 +89,7 @@ class Recorder:
         self._bridged(command)
         for name in loop.courses.finished:
             self.note("change", "loop", f"the course of {name} is over")
+        self._taken(command)
         self._changed(command)
         if loop.controller is not self.controller:
             self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")
@@ -112,6 +114,16 @@ class Recorder:
                 words = f"PV {name} is read again"
                 self.note("fault", "loop", f"over: {words}" if before else words, alarm=alarm if before else "")
         self._bad = now
+
+    def _taken(self, command: Command) -> None:
+        """Say which MVs the plant has itself, which is an alarm, and which it has given back."""
+        before, self._local = self._local, command.local
+        for name, why in command.local.items():
+            if name not in before or kind_of(before[name]) != kind_of(why):
+                self.note("fault", "loop", f"MV {name} is out: {lasting(why)}", alarm=f"actuator {name}", raised=True)
+        for name in before:
+            if name not in command.local:
+                self.note("fault", "loop", f"over: MV {name} is the loop's again", alarm=f"actuator {name}")
 
     def _changed(self, command: Command) -> None:
         """Say that the mode is another one though nobody asked for it: HOLD by a fault, and the way back."""

@@ -234,11 +234,11 @@ def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
     signals = loop.controller.manifest.mv
     wanted = _numbers(request.value, signals, loop.mv_wanted.tolist(), "MV")
     within(wanted, signals, "MV")
-    if loop.mode is not Mode.MANUAL:
-        raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {loop.mode}")
+    loop.require_in_hand(request.value)
     what = _moves(loop.mv_wanted.tolist(), wanted, signals, "MV")
 
     def act(loop: ControlLoop) -> None:
+        loop.require_in_hand(request.value)
         loop.set_mv(_numbers(request.value, signals, loop.mv_wanted.tolist(), "MV"))
 
     return Change(act, what, request.who, request.reason)

@@ -39,6 +39,7 @@ from loopwright.serving.station.build_loop import (
 )
 from loopwright.serving.station.control import Answer, Control
 from loopwright.serving.station.housekeeping import LinePrinter, PeriodicTask
+from loopwright.serving.station.last_run import Steered
 from loopwright.serving.station.mv_lock import Lease, Locks
 from loopwright.serving.station.plant_side import PlantSide, shown_values
 from loopwright.serving.station.recorder import MonitorRunner, Recorder
@@ -108,6 +109,7 @@ class Station:
         except BaseException:
             self.lease.release()
             raise
+        self._steered = Steered.before(settings.journal.file)
         self.recorder = Recorder(self.journal, tell, settings.speed)
         self.recorder.end_old_alarms()
         self.locks = Locks(self.lease, self.recorder)
@@ -185,6 +187,8 @@ class Station:
             unproven = judged(m).words if s.start == "AUTO" else ""
             accepted = f"accepted though {unproven}" if unproven else ""
             self.recorder.note("change", "loop.toml", f"started in {s.start}{by}", accepted)
+            again = self._steered.restore if s.restore else self._steered.compare
+            again(self.loop, lambda what, reason: self.recorder.note("change", "loop.toml", what, reason))
             report = self.loop.run(n, before=self._before, observe=self._observe, stop=lambda: self.ended)
             self.recorder.note("change", "loop", "ended")
             return report
@@ -262,6 +266,10 @@ class Station:
             self.endpoint.serve(self.loop.controller.manifest)
         if not np.isnan(command.mv).any():
             self._left_at = command.mv
+        steered = Steered.of(self.loop)
+        if steered != self._steered:
+            self._steered = steered
+            steered.keep(self.journal)
         try:
             self.recorder.scan(self.loop, sample, command)
             self.watching.seen(stepped, seen)

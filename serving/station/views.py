@@ -147,6 +147,7 @@ def state(station: Station) -> View:
         "bridged": dict(command.bridged),
         "shed": dict(command.shed),
         "unread_s": None if seen.inputs is None else _plain(seen.inputs.unread_s),
+        "local": dict(command.local),
         "quality": [] if sample is None else [words(status) for status in sample.quality],
         "sha256": seen.controller.sha256,
         "successor": seen.successor,

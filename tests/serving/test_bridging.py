@@ -101,7 +101,7 @@ def test_the_loop_holds_where_no_controlled_variable_is_left(operated: Controlle
     for _ in range(BRIDGE):
         assert loop.scan(sample(t=NAN, p=-9.0)).mode is Mode.AUTO
     for _ in range(3):
-        assert held(loop.scan(sample(t=NAN, p=-9.0)), "PV T")
+        assert held(loop.scan(sample(t=NAN, p=-9.0)), "PV T, PV p")
     assert loop.scan(sample(t=NAN)).mode is Mode.HOLD  # a good sample is one that the law may act on
     command = loop.scan(sample(t=NAN))
     assert (command.mode, list(command.shed)) == (Mode.AUTO, ["T"])
@@ -377,3 +377,13 @@ def test_whatever_is_read_the_law_gets_good_numbers_and_bad_ones_are_named(opera
         assert seen.pv == last
         assert {n for n, fresh in seen.fresh.items() if not fresh} == bad
         assert {n for n in ("T", "p") if not seen.operate[f"{n}.use"]} == set(command.shed)
+
+
+@pytest.mark.parametrize("critical", [(), ("T", "p")], ids=["none left", "critical"])
+def test_hold_names_every_pv_that_is_missing(operated: Controller, critical: tuple[str, ...]) -> None:
+    loop = loop_of(operated, critical=critical)
+    loop.scan(sample())
+    command = [loop.scan(sample(t=NAN, p=NAN)) for _ in range(BRIDGE + 1)][-1]
+    assert command.mode is Mode.HOLD
+    assert "PV T" in command.fault
+    assert "PV p" in command.fault

@@ -311,6 +311,7 @@ OPERATED_WORDS: Mapping[What, str] = {
     "track": "1: the set point is wanted, 0: the range alone",
     "low": "low end of the range in which it may be",
     "high": "high end of the range in which it may be",
+    "weight": "times that of its set point; the smaller one gives way",
     "rank": "1: its range is kept before those of 2",
     "max_move": "largest move a period",
     "rest": "where it goes that nothing asks for",

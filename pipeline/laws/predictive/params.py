@@ -67,7 +67,7 @@ class PredictiveParams:
     cv_low: Limits = None
     cv_high: Limits = None
     preview: Literal["held", "ramp", "course"] = "held"
-    operate: Mapping[str, float] | None = None
+    operate: Mapping[str, float | bool] | None = None
 
     def __post_init__(self) -> None:
         for name in ("speed", "caution", "jumps", "move_weight", "eps", "q_x", "q_d"):

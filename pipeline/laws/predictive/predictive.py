@@ -387,7 +387,7 @@ class Predictive(ControlLaw):
         return PlanProblem(*given, mean, now, kept, seen, boost, next_kept, stands, mv_applied)
 
     def answer(self, problem: PlanProblem, plan: Tensor, soon: Tensor) -> Stepped:
-        """MV, next state and info of a step; of its ``plan`` (..., 1, m), and the next outputs ``soon`` (..., 1, n_o)."""
+        """MV, next state and info of a step with its ``plan`` (..., 1, m) and next outputs ``soon`` (..., 1, n_o)."""
         now, stands = problem.now, problem.stands
         n_cv, mean = len(self.signals.sp), problem.mean
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)

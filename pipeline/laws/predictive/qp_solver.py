@@ -81,7 +81,7 @@ class LimitCost(NamedTuple):
 class OperatedPlan(NamedTuple):
     """Wishes of the operators for a plan, scaled: of outputs (..., 1, N n_o), of a plan's moves (..., 1, m)."""
 
-    track: Tensor  # 1 where a set point is followed, 0 elsewhere
+    track: Tensor  # of a set point over its designed weight; 0 where none is followed
     low: Tensor  # of the outputs' ranges
     high: Tensor
     low_inside: Tensor  # where the price of leaving it begins
@@ -294,7 +294,8 @@ class Planner(nn.Module):
             sum_k sum_o  t_o q_o sqrt((y_o - r_o)^2 + eps^2) + p_o(b_o) + c_o y_o
             + mu s sum_j |z_j - z_{j-1}|^2 + sum_j w_j (z_j - rest)^2/2 + c_j z_j
 
-        t is 1 for a set point that is followed, b_o what lies beyond the range of output o, p_o the cost of
+        t is the weight of a set point over the designed one, 0 where none is followed, b_o what lies beyond the range
+        of output o, p_o the cost of
         ``SoftLimits`` with its price by rank, s the stiffness. A set point outside its range counts as the end of it.
         """
         stiff = by.stiffness * self.moved + by.rest_weight * self.eye
