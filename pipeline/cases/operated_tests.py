@@ -18,10 +18,11 @@ from loopwright.pipeline.config.operator_tests import AT, OperatedTestParams, Ti
 from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.evaluation.case import Array, Case
 from loopwright.pipeline.evaluation.operated import OperatedLimits
+from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.operator_changes import OperatorChange
 from loopwright.pipeline.simulation.rests import courses
 from loopwright.pipeline.simulation.scenario import Scenario
-from loopwright.serving.manifest import OperateEntry, Signal
+from loopwright.serving.manifest import OF_GROUP, OperateEntry, Signal
 
 CHANGE_AT = LOAD_AT  # sample at which operators change something: the law has begun by then
 LEAST_SAMPLES = 300  # of a test with costs or resting values, which move MVs slowly: 100 to 200 samples and a rest
@@ -71,13 +72,31 @@ def _share(percent: float | None, default: float) -> float:
 
 
 # ------------------------------------------------------------------------------------------------ tests of params.yaml
+def check_operated(case: Case, own: Mapping[str, OperatedTestParams]) -> None:
+    """ParamsError for a test of params.yaml that names a signal which the plant has not, before any law is designed."""
+    pv, mv = (case.plant_class.pv_signals, case.plant_class.mv_signals)
+    known = [f"{s.name}.{what}" for s in pv for what in sorted(OF_GROUP["cv"])]
+    known += [f"{s.name}.{what}" for s in mv for what in sorted(OF_GROUP["mv"])] + sorted(OF_GROUP["law"])
+    for test, params in own.items():
+        groups = (
+            ("operate", params.operate, known, "entry of operate"),
+            ("set_points", params.set_points, [s.name for s in case.plant_class.sp_signals], "set point"),
+            ("measured", params.measured, [s.name for s in case.plant_class.dv_signals], "disturbance"),
+        )
+        for group, rows, names, what in groups:
+            for name in (key for row in rows for key in row if key != AT and key not in names):
+                raise ParamsError(
+                    f"cases.{case.name}.operated.{test}.{group}: there is no {what} {name!r}{nearest(name, names)}"
+                )
+
+
 def _of_params(
     case: Case, entries: Sequence[OperateEntry], name: str, params: OperatedTestParams
 ) -> tuple[Scenario, ...]:
     """A test of params.yaml on each model of an own plant's record, or on a case's plant."""
     where, period = f"cases.{case.name}.operated.{name}", case.plant.period_s
     n = math.ceil(params.duration_s / period - 1e-9)
-    plants = case.members if isinstance(case, OwnCase) else (case.plant,)
+    plants: tuple[Simulator, ...] = case.members if isinstance(case, OwnCase) else (case.plant,)
     found = []
     for plant in plants:
         x0, mv0 = plant.start
@@ -90,7 +109,8 @@ def _of_params(
         _fill(p, params.changes, names, period, f"{where}.changes", "parameter of the plant")
         moved = {key: p[:, i] for i, key in enumerate(names) if any(key in row for row in params.changes)}
         operate = tuple(
-            OperatorChange(round(row[AT] / period), {k: v for k, v in row.items() if k != AT}) for row in params.operate
+            OperatorChange(min(round(row[AT] / period), n - 1), {k: v for k, v in row.items() if k != AT})
+            for row in params.operate
         )
         title = params.title or name.replace("_", " ").capitalize()
         test = Scenario(name, title, sp, x0, mv0, moved, plant=plant, dv=dv, operate=operate)
@@ -129,7 +149,7 @@ class _Made:
         """Name -> the test on each model; those that a plant does not allow are left out."""
         plants = self.case.members
         turns = list(zip(range(max(len(self.mvs), len(plants))), cycle(plants), strict=False))
-        found = {
+        found: dict[str, Sequence[Scenario | None]] = {
             "narrowed": [self.narrowed(p, seed) for seed, p in zip(self.case.held_out_seeds, plants, strict=False)],
             "taken_out": [self.taken_out(p, self.case.held_out_seeds[0], j % len(self.mvs)) for j, p in turns],
             "costs": [self.costs(p) for p in plants],

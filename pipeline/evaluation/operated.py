@@ -195,6 +195,15 @@ def summary_of(tests: Mapping[str, OperatedResult]) -> dict[str, float]:
     return {name: value for name, value in (("outside_late", late), ("gain", gain)) if value is not None}
 
 
+def words_of(tests: Mapping[str, OperatedResult]) -> str:
+    """The same in words; empty where neither was measured."""
+    found = summary_of(tests)
+    late, gain = found.get("outside_late"), found.get("gain")
+    parts = [f"outside a range {100 * late:.3g} % of the time"] if late is not None else []
+    parts += [f"{100 * gain:.3g} % of the profit to be gained"] if gain is not None else []
+    return f"operators' changes: {', '.join(parts)}" if parts else ""
+
+
 def _one_unit(mvs: Iterable[MvResult]) -> bool:
     """Whether the travels can be summed: those of unlike units cannot."""
     return len({one.unit for one in mvs}) == 1

@@ -64,7 +64,7 @@ def _wider(worst: RangeResult, result: OperatedResult) -> str:
         return f"{clamped}: wider limits of it give the law room"
     return (
         f"{worst.signal} was up to {_value(worst.most, worst.unit)} outside: give it a range that much wider, or a "
-        "rank before the others'; `caution` below 1 lets the law answer to loads sooner"
+        "rank before the others'; caution below 1 lets the law answer to loads sooner"
     )
 
 
@@ -100,7 +100,7 @@ def _hasty(result: OperatedResult) -> str:
     if worst.travel_share <= HASTY_TRAVEL:
         return ""
     far = number(worst.travel_share, 2)
-    return f"{worst.signal} travelled {far} times its range: `speed` of .5 or less, or a `max_move`, makes it calmer"
+    return f"{worst.signal} travelled {far} times its range: speed of .5 or less, or a max_move, makes it calmer"
 
 
 def _clamped(result: OperatedResult) -> str:
@@ -128,7 +128,7 @@ def _ranks(law: str, tests: Tests) -> Iterator[CheckedStatement]:
 
 def _rests(law: str, tests: Tests) -> Iterator[CheckedStatement]:
     """How far an MV is from its resting value in the end."""
-    name, miss = _worst({name: of.miss and of.miss.miss_share for name, of in tests.items()}, max)
+    name, miss = _worst({name: of.miss.miss_share for name, of in tests.items() if of.miss}, max)
     if miss is None:
         return
     worst, holds = tests[name].miss, miss <= MOST_REST_MISS
@@ -144,7 +144,7 @@ def _rests(law: str, tests: Tests) -> Iterator[CheckedStatement]:
 
 def _taken_out(law: str, tests: Tests) -> Iterator[CheckedStatement]:
     """An MV out of use does not move, and set points are reached again in the end."""
-    name, moved = _worst({name: of.moved_out and of.moved_out.moved_out for name, of in tests.items()}, max)
+    name, moved = _worst({name: of.moved_out.moved_out for name, of in tests.items() if of.moved_out}, max)
     if moved is not None:
         yield CheckedStatement(
             f"{law}, MVs taken out: largest move of one while it is out",
@@ -152,7 +152,7 @@ def _taken_out(law: str, tests: Tests) -> Iterator[CheckedStatement]:
             f"{percent(moved)} in test {name}",
             moved <= MOST_MOVED_OUT,
         )
-    name, share = _worst({name: of.error and of.error.share for name, of in tests.items()}, max)
+    name, share = _worst({name: of.error.share for name, of in tests.items() if of.error}, max)
     if share is None:
         return
     worst, holds = tests[name].error, share <= UNREACHED_ERROR
@@ -175,16 +175,16 @@ def _worst(of: Mapping[str, float | None], choose: Callable[..., Any]) -> tuple[
 
 # -------------------------------------------------------------------------------------------------------------- tables
 RANGES = (
-    "Variable", "Range in the end", "Outside, whole test [% of time]", "Outside, in the end [% of time]",
-    "Mean distance outside", "Largest", "Best steady state",
+    "Variable", "Range", "Outside [% of time]", "In the end [% of time]", "Outside on average", "At most",
+    "Best steady state",
 )  # fmt: skip
 MVS = (
     "MV",
     "Travel",
-    "At an operator's limit [% of time]",
-    "Largest move while out [% of range]",
+    "At operators' limits [% of time]",
+    "Moved while out [% of range]",
     "Resting value",
-    "From there, in the end",
+    "From there in the end",
 )
 PROFITS = ("Test", "At the start", "In the end", "Best steady state", "Share of the gain [%]")
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.plants.simulator import Array
@@ -62,7 +63,7 @@ class OperatedCourse:
         course = self.of_signal(signal, what)
         return default if course is None else float(course[sample])
 
-    def changed(self) -> Array:
+    def changed(self) -> NDArray[np.intp]:
         """Samples (k,) at which any entry changes; sample 0 counts where it begins off its defaults."""
         default = np.array([entry.default for entry in self.entries])
         moved = np.any(np.diff(self.values, axis=0, prepend=default[None]) != 0, axis=1)
