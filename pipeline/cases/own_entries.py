@@ -23,10 +23,10 @@ def entries_of(
 ) -> dict[str, dict[str, Any]]:
     """The entries of params.yaml for an own plant: its section, its tests, its models, and its controllers.
 
-    These are two of ours, and with believed ``old`` ones of all controlled variables the loop that they make up. With
-    ``export`` its files too, of which stage `screen` makes the record; without, ``plant`` says where that is. With the
-    defaults of ``operate``, which may be none, operators change the predictive law while it runs, and its model has
-    all process variables as outputs.
+    These are two of ours, or predictive control alone where a controlled variable is an analyser, and with believed
+    ``old`` ones of all controlled variables the loop that they make up. With ``export`` its files too, of which stage
+    `screen` makes the record; without, ``plant`` says where that is. With the defaults of ``operate``, which may be
+    none, operators change the predictive law while it runs, and its model has all process variables as outputs.
     """
     from loopwright.pipeline.models.identified.structure_search import (
         MINUTES,  # here, because torch takes seconds to load
@@ -43,6 +43,9 @@ def entries_of(
     own = {"case": name, "model": MODEL_SET}
     data = screened_record(name).as_posix() if export else plant["data"]
     loops = loops_of(plant, old)
+    # A PID winds up on a number that stands: none is built for an analyser.
+    seldom = any(s.get("every", 1) > 1 for s in plant["pv"][:n_cv])
+    pid = {} if seldom else {f"{name}-pid": {**own, "name": "pid", "law": "pid", **_pairs(loops)}}
     believed = bool(loops) and all(law.believed for law in loops)
     before = {f"{name}-{OLD_LOOP}": {**own, "name": OLD_LOOP, **_as_pid(loops), **_pairs(loops)}} if believed else {}
     return {
@@ -52,7 +55,7 @@ def entries_of(
         "models": {f"{name}-{MODEL_SET}": {**own, "data": data, "parts": parts}},
         "controllers": {
             f"{name}-predictive": {**own, "name": "predictive", "law": "predictive", "tuning": "search", **steered},
-            f"{name}-pid": {**own, "name": "pid", "law": "pid", **_pairs(loops)},
+            **pid,
             **before,
         },
     }

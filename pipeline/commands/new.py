@@ -47,6 +47,7 @@ from loopwright.pipeline.config.params import add_entries, sections
 from loopwright.pipeline.config.plants import check_name
 from loopwright.pipeline.errors import PipelineError, RecordError
 from loopwright.pipeline.files import draft_folder_of, write_json, write_text
+from loopwright.pipeline.historian.cleaning.new_readings import rows_between
 from loopwright.pipeline.historian.cleaning.record_rows import evenly
 from loopwright.pipeline.historian.cleaning.tags import RANGES, ROLES, TableError, Tag, named
 from loopwright.pipeline.historian.export_params import read_and_screen, with_units
@@ -289,8 +290,10 @@ def _words(refused: Refusal) -> str:
 def signals_of(record: Record, tags: Sequence[Tag] = ()) -> dict[str, Any]:
     """Period and signals as ``plants.<name>`` of params.yaml holds them; ``tags`` say what may be commanded."""
     groups = {"pv": record.pv_signals, "mv": record.mv_signals, "dv": record.dv_signals}
-    commands = {t.name: t.commands for t in tags}
+    own: dict[str, dict[str, Any]] = {t.name: dict(t.commands) for t in tags}
+    for i, fresh in record.seldom.items():
+        own.setdefault(record.pv_signals[i].name, {})["every"] = rows_between(fresh)
     return {
         "period_s": record.period_s,
-        **{role: [s.to_dict() | commands.get(s.name, {}) for s in signals] for role, signals in groups.items()},
+        **{role: [s.to_dict() | own.get(s.name, {}) for s in signals] for role, signals in groups.items()},
     }

@@ -150,7 +150,6 @@ def close_loop(
     where the course changes what operators may not change of this file; LoopError where it has nothing that they may
     change, and for a wrong value of what is known.
     """
-    """
     simulated, history = SimulatedPlant(plant, course), History(mv0=course.mv0, entries=controller.manifest.operate)
     operated = {change.at: change.values for change in course.operate}
     if controller.manifest.operate and operated:

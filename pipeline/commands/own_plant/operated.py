@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.cleaning.new_readings import rows_between
 from loopwright.pipeline.historian.cleaning.tags import Tag, commanded_range
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record
@@ -47,6 +48,8 @@ class Operated:
         for signal in record.mv_signals:
             if (tag := own.get(signal.name)) is not None:
                 found._of_mv(signal, tag, commanded_range(signal, tags))
+        for i, fresh in record.seldom.items():
+            found._say_no_pid(record.pv_signals[i], rows_between(fresh), own.get(record.pv_signals[i].name))
         without = sum(s.name in own and own[s.name].constraint for s in record.pv_signals)
         most = min(len(record.pv_signals) - without, len(record.mv_signals))
         return cls(found.defaults, found.lines, most if without else None)
@@ -76,6 +79,14 @@ class Operated:
         for what in ("rank", "cost"):
             if tag is not None and (number := getattr(tag, what)) is not None:
                 self._put(signal, what, number)
+
+    def _say_no_pid(self, signal: Signal, every: int, tag: Tag | None) -> None:
+        """A line on the law that is not built for an analyser with a set point."""
+        if tag is None or not tag.constraint:
+            self.lines.append(
+                f"{signal.name}: no PID is built, as it has a new reading every {every} rows and a PID would wind "
+                "up on the number that stands between; predictive control goes on by its model"
+            )
 
     def _of_mv(self, signal: Signal, tag: Tag, commands: tuple[float, float]) -> None:
         """The rest and the cost of an MV that may be commanded within ``commands``."""
