@@ -1,19 +1,19 @@
 """Eight plants under ranges, costs and resting values: the predictive law from a record, PIDs, and the perfect NMPC.
 
-``python benchmarks/operated_plants [PLANT ...]``: some minutes a plant at first (models and the PIDs' numbers are kept in
-the folder for temporary files), then three rows of figures over the days of the seeds 101 to 103, 480 samples each, of
-which the first 40 are not scored:
+``python benchmarks/operated_plants [PLANT ...]``: some minutes a plant at first (models and the PIDs' numbers are kept
+in the folder for temporary files), then three rows of figures over the days of the seeds 101 to 103, 480 samples each,
+of which the first 40 are not scored:
 
-- ours: the model is identified from one record of 8,000 rows with noise, and with all that wanders and is not measured.
-  The law has all defaults beside what operators set (``operate`` of the plant). The runtime steps its exported file.
-  An analyser's model comes from a record in which it reads at every row, late; on the day it reads seldom.
+- ours: the model is identified from one record of 8,000 rows with noise, and with all that wanders unmeasured. The
+  law has all defaults beside what operators set (``operate`` of the plant). The runtime steps its file. An
+  analyser's model comes from a record in which it reads at every row, late; on the day it reads seldom.
 - PID: schemes as engineers build them, tuned on the true plant on days that are not scored (``pid_blocks.py``).
 - NMPC: the true equations, the same measurements through a Kalman filter, the law's cost (``perfect_economic.py``).
 
 ``error``: mean absolute error in % of the set points' ranges; ``/NMPC``: over the NMPC's. ``in range``: % of samples
-with all PVs within their ranges; ``beyond``: what lies outside, in % of a range's width, in the mean. ``profit`` an hour
-by the costs of ``operate``; ``of NMPC``: share of what the NMPC gains over the PIDs. ``travel``: % of the MVs' ranges a
-sample.
+with all PVs within their ranges; ``beyond``: what lies outside, in % of a range's width, in the mean. ``profit`` an
+hour by the costs of ``operate``; ``of NMPC``: in % of the NMPC's, of costs 100 % less what is spent
+beyond the NMPC's. ``travel``: % of the MVs' ranges a sample; ``rest``: % of them that MVs with a rest are off it.
 
 ``--operating``: priorities where ranges are at odds, and bumps of changes, on the files of three plants instead.
 ``--json FILE`` keeps the figures, ``--picture FILE`` draws the first day of the first plant.

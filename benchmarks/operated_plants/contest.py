@@ -21,7 +21,9 @@ from loopwright.pipeline.plants.simulator import Array
 SCORED = (101, 102, 103)  # seeds of the days that count
 TUNING = (901, 902)  # of those on which the PIDs are tuned
 TUNING_DAY = 360  # samples
-BEYOND, TRAVEL, COST = 10.0, 0.5, 1.0  # of the tuning's cost, beside an error of 1 % of a set point's range
+# Of the tuning's cost, beside an error of 1 % of a set point's range: 1 % of a range beyond it in the mean, 1 % of
+# travel a sample, 1 % of the largest cost's span, and 1 % off a resting value.
+BEYOND, TRAVEL, COST, REST = 10.0, 0.5, 1.0, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +39,16 @@ class Contest:
 
 def tuned_settings(plant: OperatedPlant, samples: int = TUNING_DAY, days: Sequence[int] = TUNING) -> Array:
     """The numbers of the plant's PIDs, tuned on days that are not scored; kept in a file."""
-    known = [plant.name, plant.title, samples, list(days), dict(plant.settings), dict(plant.operate), _digest(plant)]
+    known = [
+        plant.name,
+        plant.title,
+        REST,
+        samples,
+        list(days),
+        dict(plant.settings),
+        dict(plant.operate),
+        _digest(plant),
+    ]
     path = FOLDER / f"{plant.name}-pid-{hashlib.sha256(json.dumps(known).encode()).hexdigest()[:12]}.json"
     if path.exists():
         return np.array(json.loads(path.read_text()))
@@ -53,7 +64,9 @@ def tuned_settings(plant: OperatedPlant, samples: int = TUNING_DAY, days: Sequen
             return np.inf
         f = figures_of(plant, courses, runs)
         spent = -f.profit / 20 / largest * 100
-        found = np.nan_to_num(f.error) + BEYOND * f.beyond + TRAVEL * f.travel + COST * spent
+        found = (
+            np.nan_to_num(f.error) + BEYOND * f.beyond + TRAVEL * f.travel + COST * spent + REST * np.nan_to_num(f.rest)
+        )
         return float(found) if np.isfinite(found) else np.inf
 
     best = searched(np.array(list(plant.settings.values())), cost)
@@ -99,27 +112,27 @@ def contested(
 
 HEAD = (
     f"{'plant':12} {'':5} {'error [%]':>9} {'/NMPC':>6} {'in range [%]':>12} {'beyond [%]':>10}"
-    f" {'profit/h':>9} {'of NMPC':>8} {'travel':>7} {'[s]':>6}"
+    f" {'profit/h':>9} {'of NMPC':>8} {'travel':>7} {'rest':>5} {'[s]':>6}"
 )
 
 
 def rows_of(contest: Contest) -> str:
     """Three rows of a table."""
-    bound, base = contest.figures["NMPC"], contest.figures["PID"]
+    bound = contest.figures["NMPC"]
     lines = []
     for name, f in contest.figures.items():
         ratio = f.error / bound.error if np.isfinite(f.error) else np.nan
-        share = gained(f.profit, base.profit, bound.profit)
+        share = share_of(f.profit, bound.profit)
         lines.append(
             f"{contest.plant.name if name == 'ours' else '':12} {name:5} {f.error:9.3f} {ratio:6.2f} {f.inside:12.1f}"
-            f" {f.beyond:10.4f} {f.profit:9.2f} {share:>8} {f.travel:7.2f} {contest.seconds[name]:6.0f}"
+            f" {f.beyond:10.4f} {f.profit:9.2f} {share:>8} {f.travel:7.2f} {f.rest:5.1f} {contest.seconds[name]:6.0f}"
         )
     return "\n".join(lines)
 
 
-def gained(profit: float, base: float, bound: float) -> str:
-    """Share of what the NMPC gains over the PIDs [%]; "-" where there are no costs."""
-    return "-" if bound == base else f"{100 * (profit - base) / (bound - base):.1f}"
+def share_of(profit: float, bound: float) -> str:
+    """Profit over the NMPC's [%]; of costs, 100 % less what is spent beyond the NMPC's. "-" where there are none."""
+    return "-" if bound == 0 else f"{100 + 100 * (profit - bound) / abs(bound):.1f}"
 
 
 def as_json(contest: Contest) -> str:

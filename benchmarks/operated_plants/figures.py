@@ -56,11 +56,12 @@ class Figures:
     beyond: float  # % of a range's width, mean over all samples and limited PVs
     profit: float  # an hour, by the costs of `operate`
     travel: float  # % of the MVs' range a sample
+    rest: float  # % of the range that an MV with a resting value is off it; NaN without one
 
 
 def figures_of(plant: OperatedPlant, days: list[Day], runs: list[Run]) -> Figures:
     """The figures over all days, each without its warm-up; of true PVs, without noise."""
-    errors, inside, beyond, profit, travel = [], [], [], [], []
+    errors, inside, beyond, profit, travel, off = [], [], [], [], [], []
     of_pv, of_mv = plant.costs
     reach = np.array([s.high - s.low for s in plant.mv])
     for day, run in zip(days, runs, strict=True):
@@ -79,5 +80,8 @@ def figures_of(plant: OperatedPlant, days: list[Day], runs: list[Run]) -> Figure
         beyond += over
         profit.append(-(pv @ of_pv + mv @ of_mv))
         travel.append(np.abs(np.diff(mv, axis=0)) / reach)
-    mean = [float(np.mean(v)) if v else np.nan for v in (errors, inside, beyond, profit, travel)]
-    return Figures(100 * mean[0], 100 * mean[1], 100 * mean[2], HOUR * mean[3], 100 * mean[4])
+        for i, s in enumerate(plant.mv):
+            if plant.operate.get(f"{s.name}.rest_use"):
+                off.append(np.abs(mv[:, i] - plant.operate[f"{s.name}.rest"]) / reach[i])
+    mean = [float(np.mean(v)) if v else np.nan for v in (errors, inside, beyond, profit, travel, off)]
+    return Figures(100 * mean[0], 100 * mean[1], 100 * mean[2], HOUR * mean[3], 100 * mean[4], 100 * mean[5])

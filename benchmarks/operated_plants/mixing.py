@@ -22,7 +22,7 @@ def _tank(x: Any, u: Any, d: Any, w: Any) -> list[Any]:
 
 
 class TankScheme:
-    """Averaging level control by a slow PI, the inflow's mean fed forward; temperature by a PI, the inflow fed forward."""
+    """Averaging level control by a slow PI and the inflow's mean; temperature by a PI and the inflow, fed forward."""
 
     def __init__(self, plant: OperatedPlant, numbers: Array) -> None:
         kt, tt, kl, tl, self.follow, self.of_flow = numbers

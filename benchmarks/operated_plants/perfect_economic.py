@@ -3,10 +3,10 @@
     min  sum_k [ sum_o q rho(e_o(k)) + sum_o P(rank_o) rho(b_o(k)) + s (c_y y(k) + c_z z(k)) ]
          + mu sum_j |z_j - z_{j-1}|^2 + sum_k w rest_use (z(k) - rest)^2/2
 
-e is the error on a set point that is followed, b what lies beyond a range, all in the law's own scales; weights, prices,
-slope of the costs, move weight, horizon and margin are the law's. It has 8 moves of each MV where the law has 5, and
-IPOPT solves it at each sample. The extended Kalman filter knows the equations, and the means, speeds and sizes of what
-wanders; it has the measurements that the law has, an analyser's as they come.
+e is the error on a set point that is followed, b what lies beyond a range, all in the law's own scales; weights,
+prices, slope of the costs, move weight, horizon and margin are the law's. It has 8 moves of each MV where the law has
+5, and IPOPT solves it at each sample. The extended Kalman filter knows the equations, and the means, speeds and sizes
+of what wanders; it has the measurements that the law has, an analyser's as they come.
 """
 
 from __future__ import annotations

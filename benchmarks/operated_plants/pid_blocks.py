@@ -1,9 +1,9 @@
 """Blocks of which engineers build control schemes: PI with tracking, selectors, feed-forward, and their tuning.
 
-The rule of tuning: gains and reset times start where a step response of the true plant puts them (SIMC), or as the
-plant's file says; then each number in turn is multiplied and divided by a factor that shrinks (1.6, 1.25, 1.1) as long
-as the cost of two days falls, whose seeds are not scored. The cost is what is scored: error on set points over their
-ranges, ten times what lies beyond a range, a tenth of the MVs' travel, and what the costs of ``operate`` make of it.
+The rule of tuning: gains and reset times start where the plant's file has them, from its lags; then each number in
+turn is multiplied and divided by a factor that shrinks (1.6, 1.25, 1.1) as long as the cost of two days falls, whose
+seeds are not scored. The cost is what is scored: the error on set points, ten times what lies beyond a range, half of
+the MVs' travel, all in %, and what the costs of ``operate`` make of the day.
 """
 
 from __future__ import annotations
