@@ -139,7 +139,7 @@ class ControlLoop:
         self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
-        self._hand = ByHand()
+        self._hand, self._took_over = ByHand(), False  # whether a shadow has just ended: others may have moved the MV
 
     # ------------------------------------------------------------------ who is in charge
     @property
@@ -214,6 +214,7 @@ class ControlLoop:
         if mode is not self.mode:
             self._transfer.begin()
             self._hand.wanted = None
+            self._took_over = self.mode is Mode.SHADOW
         self._mode.set(mode)
 
     def set_sp(self, sp: ArrayLike) -> None:
@@ -248,6 +249,7 @@ class ControlLoop:
         if self._applied.lost:
             raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
         self._mv = self._hand.sent(self._mv, within(mv, self.controller.manifest.mv, "MV"), self.controller.manifest.mv)
+        self._took_over = self._took_over and self._hand.wanted is not None  # else the MV is where it was sent
 
     def hand_back(self) -> None:
         """The plant is with its own controller now: this loop writes no more, until the mode is set again."""
@@ -261,6 +263,8 @@ class ControlLoop:
         self._applied.arrived()
         shown = self._applied.look(sample, self._mv, refused=bool(reason))
         self.found = shown.found
+        if self._took_over and shown.applied is not None:
+            self._mv = shown.applied.copy()
         if shown.silent:
             if shown.outside:
                 self._mv = np.full(len(self._mv), nan)
@@ -351,6 +355,7 @@ class ControlLoop:
 
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
+        self._took_over = False
         back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
         command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back)
         self._applied.command(self._mv, written=command.writes)

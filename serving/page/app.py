@@ -26,12 +26,14 @@ from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
 from loopwright.serving.graph.audit import MAX_GRAPH_BYTES, audit
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
+from loopwright.serving.monitor.weekly_report import plain_rows, week_reports
 from loopwright.serving.page.access import LONGEST_BODY, Access
 from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, Shared, shown
 from loopwright.serving.page.trend import MOST_POINTS, trend
 from loopwright.serving.words import plain
 
 MOST_FILES = 50  # files that are looked at
+SHOWN_WEEKS = 5  # weeks that the card shows: a month and the present one
 
 
 def candidates(
@@ -123,6 +125,8 @@ def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tu
     yield "info", "gauge", "Numbers that the law tells of itself.", [({"name": name}, v) for name, v in infos]
     numbers = state.get("numbers") or {}
     yield "monitor", "gauge", "Numbers that the monitor has measured.", [({"name": n}, v) for n, v in numbers.items()]
+    week = [({"name": n}, v) for n, v in (state.get("week") or {}).items() if n != "began"]
+    yield "week", "gauge", "Time on control this week (from Monday, UTC), and what bound signals in AUTO.", week
     verdicts = state.get("verdicts") or []
     levels = [({"name": v["name"]}, LEVELS[v["level"]]) for v in verdicts if v["level"] in LEVELS]
     words = "Is the controller still right? 0 as validated, 1 watch, 2 retrain, -1 not known yet."
@@ -165,6 +169,7 @@ class PageApp:
             Route("/api/state", self.state),
             Route("/api/trend", self.trend),
             Route("/api/events", self.events),
+            Route("/api/weeks", self.weeks),
             Route("/api/live", self.stream),
             Route("/api/picture/{digest}", self.picture),
             Route("/api/change", self.change, methods=["POST"]),
@@ -252,6 +257,11 @@ class PageApp:
                 return [shown(entry) for entry in reader.entries(int(limit))]
 
         return JSONResponse({"events": await asyncio.to_thread(read)})
+
+    async def weeks(self, _: Request) -> Response:
+        """The last weeks in plain words, newest first."""
+        found = await asyncio.to_thread(week_reports, self.journal, SHOWN_WEEKS)
+        return JSONResponse({"weeks": plain_rows(found[::-1])})
 
     async def stream(self, request: Request) -> Response:
         """News, as server-sent events."""

@@ -264,10 +264,11 @@ class Station:
             self._left_at = command.mv
         try:
             self.recorder.scan(self.loop, sample, command)
-            self.watching.seen(stepped, seen)
+            operate = np.asarray(self.loop.operate) if self.loop.controller is stepped else None
+            self.watching.seen(stepped, seen, operate)
         finally:  # a scan that cannot be written down is a scan
             counts = self._missed_periods, self._faults
-            self.snapshot = Snapshot.of(self.loop, self.watching.monitor, seen, stepped, counts)
+            self.snapshot = Snapshot.of(self.loop, self.watching, seen, stepped, counts)
         for show in self._watchers:
             show(sample, command)
 

@@ -13,12 +13,14 @@ from loopwright.serving.controller import Controller
 from loopwright.serving.guard import Sample
 from loopwright.serving.journal import columns
 from loopwright.serving.loop import Command, ControlLoop
-from loopwright.serving.monitor import Monitor, Verdict
+from loopwright.serving.monitor import Verdict
+from loopwright.serving.monitor.weekly_report import shares
 from loopwright.serving.opcua.values import words
 from loopwright.serving.trust import judged, signer
 from loopwright.serving.words import plain_tree
 
 if TYPE_CHECKING:
+    from loopwright.serving.station.recorder import MonitorRunner
     from loopwright.serving.station.station import Station
 
 View = dict[str, Any]
@@ -47,12 +49,14 @@ class Snapshot:
     operate: tuple[float, ...]  # as operators want it of the controller in charge
     verdicts: tuple[Verdict, ...]
     numbers: Mapping[str, float]
+    week: str  # that the counts are of
+    counts: Mapping[str, float]
 
     @classmethod
     def of(
         cls,
         loop: ControlLoop,
-        monitor: Monitor,
+        watching: MonitorRunner,
         seen: tuple[Sample | None, Command, float],
         stepped: Controller,
         counts: tuple[int, int],
@@ -63,9 +67,10 @@ class Snapshot:
         successor = None
         if new is not None:
             successor = {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
-        told = tuple(monitor.verdicts()), monitor.numbers()
-        operate = tuple(map(float, loop.operate))
-        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, operate, *told)
+        monitor, weekly = watching.monitor, watching.weekly
+        operate, told = tuple(map(float, loop.operate)), (tuple(monitor.verdicts()), monitor.numbers())
+        who, week = (loop.controller, stepped, successor, loop.replaced), (weekly.week, dict(weekly.counts))
+        return cls(seen_s, sample, command, *who, *counts, operate, *told, *week)
 
 
 def about(station: Station) -> View:
@@ -137,6 +142,7 @@ def state(station: Station) -> View:
         "faults": seen.faults,
         "verdicts": [asdict(v) for v in seen.verdicts],
         "numbers": dict(seen.numbers),
+        "week": {"began": seen.week, **shares(seen.counts)},
         "warnings": station.ending(),
     }
 

@@ -8,6 +8,7 @@ import { clock, duration, element, say, zone } from "./format.js";
 import * as log from "./log.js";
 import { steer } from "./steering.js";
 import { View } from "./view.js";
+import * as weeks from "./weeks.js";
 
 const $ = (id) => document.getElementById(id);
 const SPANS = [["5 min", 300], ["1 h", 3600], ["8 h", 28800], ["1 d", 86400], ["7 d", 604800]];
@@ -197,6 +198,7 @@ function theme(name, keep = true) {
 buttons();
 look(() => {});
 watch();
+weeks.watch();
 setInterval(watch, 1000);
 const lost = () => {
   broken = true;
