@@ -139,6 +139,7 @@ class ControlLoop:
         self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
+        self._took_over = False  # whether a shadow has just ended: others may have moved the MV
 
     # ------------------------------------------------------------------ who is in charge
     @property
@@ -221,6 +222,7 @@ class ControlLoop:
         if mode is not self.mode:
             self._transfer.begin()
             self._out.begun(mode, self._active.in_hand)
+            self._took_over = self.mode is Mode.SHADOW
         self._mode.set(mode)
 
     def set_sp(self, sp: ArrayLike) -> tuple[str, ...]:
@@ -283,6 +285,7 @@ class ControlLoop:
         if self._applied.lost:
             raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
         self._mv = self._out.hand.sent(self._mv, wanted, self.controller.manifest.mv)
+        self._took_over = self._took_over and self._out.hand.wanted is not None  # else the MV is where it was sent
 
     def require_in_hand(self, names: Collection[str]) -> None:
         """LoopError unless operators have these MVs in hand: all in MANUAL, those of ``use`` 0 in AUTO and HOLD."""
@@ -302,6 +305,8 @@ class ControlLoop:
         self._applied.arrived()
         shown = self._applied.look(sample, self._mv, refused=bool(reason), theirs=self._out.local.away)
         self.found = shown.found
+        if self._took_over and shown.applied is not None:
+            self._mv = shown.applied.copy()
         if shown.silent:
             if shown.outside:
                 self._mv = np.full(len(self._mv), nan)
@@ -401,6 +406,7 @@ class ControlLoop:
         self._scan += 1
         self.courses.over()
         self.courses.passed(1)
+        self._took_over = False
         back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
         command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back, local=self.local)
         self._applied.command(self._mv, written=command.writes)

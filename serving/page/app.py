@@ -26,6 +26,7 @@ from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
 from loopwright.serving.graph.audit import MAX_GRAPH_BYTES, audit
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
+from loopwright.serving.monitor.weekly_report import plain_rows, week_reports
 from loopwright.serving.page.access import LONGEST_BODY, Access
 from loopwright.serving.page.foresight import Foresight
 from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, Shared, shown
@@ -34,6 +35,7 @@ from loopwright.serving.page.trend import MOST_POINTS, trend
 from loopwright.serving.words import first_line
 
 MOST_FILES = 50  # files that are looked at
+SHOWN_WEEKS = 5  # weeks that the card shows: a month and the present one
 
 
 def candidates(
@@ -108,6 +110,7 @@ class PageApp:
             Route("/api/state", self.state),
             Route("/api/trend", self.trend),
             Route("/api/events", self.events),
+            Route("/api/weeks", self.weeks),
             Route("/api/live", self.stream),
             Route("/api/picture/{digest}", self.picture),
             Route("/api/explain", self.explain),
@@ -197,6 +200,11 @@ class PageApp:
                 return [shown(entry) for entry in reader.entries(int(limit))]
 
         return JSONResponse({"events": await asyncio.to_thread(read)})
+
+    async def weeks(self, _: Request) -> Response:
+        """The last weeks in plain words, newest first."""
+        found = await asyncio.to_thread(week_reports, self.journal, SHOWN_WEEKS)
+        return JSONResponse({"weeks": plain_rows(found[::-1])})
 
     async def stream(self, request: Request) -> Response:
         """News, as server-sent events."""

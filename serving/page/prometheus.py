@@ -56,6 +56,8 @@ def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tu
     yield from _operated(about, state)
     numbers = state.get("numbers") or {}
     yield "monitor", "gauge", "Numbers that the monitor has measured.", [({"name": n}, v) for n, v in numbers.items()]
+    week = [({"name": n}, v) for n, v in (state.get("week") or {}).items() if n != "began"]
+    yield "week", "gauge", "Time on control this week (from Monday, UTC), and what bound signals in AUTO.", week
     verdicts = state.get("verdicts") or []
     levels = [({"name": v["name"]}, LEVELS[v["level"]]) for v in verdicts if v["level"] in LEVELS]
     words = "Is the controller still right? 0 as validated, 1 watch, 2 retrain, -1 not known yet."

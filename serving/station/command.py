@@ -61,6 +61,11 @@ def options(parser: argparse.ArgumentParser) -> None:
     events.add_argument("--since", metavar="TIME", default="", help="from then on, as 2026-03-01T14:30 (UTC)")
     events.add_argument("--last", metavar="N", type=int, help="the last N only")
     events.add_argument("--csv", action="store_true", help="as CSV, for other tools")
+    report = commands.add_parser("report", help="a week in plain words: time on control, and what bound the signals")
+    report.add_argument(
+        "file", metavar="FILE", type=Path, nargs="?", default=SETTINGS, help="loop.toml or a journal (%(default)s)"
+    )
+    report.add_argument("--weeks", metavar="N", type=int, default=1, help="the last N weeks (%(default)s)")
 
 
 def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -101,6 +106,7 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 def run(options: argparse.Namespace) -> int:
     """Do what was asked for; the exit status."""
     does = {"init": _init, "check": _check, "run": _run, "export": _export, "events": _events, "state": _state}
+    does["report"] = _report
     return does.get(options.action, _ask)(options)
 
 
@@ -350,6 +356,15 @@ def _events(options: argparse.Namespace) -> int:
         write_csv(events, sys.stdout)
     else:
         print("\n".join(lines(events) or ["nothing has happened there"]))
+    return 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from loopwright.serving.monitor.weekly_report import week_reports
+
+    reports = week_reports(journal_of(options.file), options.weeks)
+    for i, report in enumerate(reports):
+        print("\n".join([*[""] * bool(i), *map(plain, report.lines())]))
     return 0
 
 

@@ -272,10 +272,11 @@ class Station:
             steered.keep(self.journal)
         try:
             self.recorder.scan(self.loop, sample, command)
-            self.watching.seen(stepped, seen)
+            operate = np.asarray(self.loop.operate) if self.loop.controller is stepped else None
+            self.watching.seen(stepped, seen, operate)
         finally:  # a scan that cannot be written down is a scan
             counts = self._missed_periods, self._faults
-            self.snapshot = Snapshot.of(self.loop, self.watching.monitor, seen, stepped, counts, self.snapshot)
+            self.snapshot = Snapshot.of(self.loop, self.watching, seen, stepped, counts, self.snapshot)
         for show in self._watchers:
             show(sample, command)
 

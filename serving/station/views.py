@@ -16,12 +16,14 @@ from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample
 from loopwright.serving.journal import columns
 from loopwright.serving.loop import Command, ControlLoop
-from loopwright.serving.monitor import Monitor, Verdict
+from loopwright.serving.monitor import Verdict
+from loopwright.serving.monitor.weekly_report import shares
 from loopwright.serving.opcua.values import words
 from loopwright.serving.trust import judged, signer
 from loopwright.serving.words import plain_tree
 
 if TYPE_CHECKING:
+    from loopwright.serving.station.recorder import MonitorRunner
     from loopwright.serving.station.station import Station
 
 View = dict[str, Any]
@@ -55,12 +57,14 @@ class Snapshot:
     courses: Mapping[str, tuple[float, float]]  # last point of each: time [s] from the next scan on, value
     verdicts: tuple[Verdict, ...]
     numbers: Mapping[str, float]
+    week: str  # that the counts are of
+    counts: Mapping[str, float]
 
     @classmethod
     def of(
         cls,
         loop: ControlLoop,
-        monitor: Monitor,
+        watching: MonitorRunner,
         seen: tuple[Sample | None, Command, float],
         stepped: Controller,
         counts: tuple[int, int],
@@ -75,7 +79,8 @@ class Snapshot:
         successor = None
         if new is not None:
             successor = {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
-        told = tuple(monitor.verdicts()), monitor.numbers()
+        monitor, weekly = watching.monitor, watching.weekly
+        told = tuple(monitor.verdicts()), monitor.numbers(), weekly.week, dict(weekly.counts)
         operate = tuple(map(float, loop.operate))
         operated = () if before is None or before.controller is not loop.controller else before.operated
         if not operated or operated[-1][1] != operate:
@@ -160,6 +165,7 @@ def state(station: Station) -> View:
         "faults": seen.faults,
         "verdicts": [asdict(v) for v in seen.verdicts],
         "numbers": dict(seen.numbers),
+        "week": {"began": seen.week, **shares(seen.counts)},
         "warnings": station.ending(),
     }
 

@@ -10,6 +10,7 @@ import * as log from "./log.js";
 import * as ranges from "./ranges.js";
 import { steer } from "./steering.js";
 import { View } from "./view.js";
+import * as weeks from "./weeks.js";
 
 const $ = (id) => document.getElementById(id);
 const SPANS = [["5 min", 300], ["1 h", 3600], ["8 h", 28800], ["1 d", 86400], ["7 d", 604800]];
@@ -212,6 +213,7 @@ function theme(name, keep = true) {
 buttons();
 look(() => {});
 watch();
+weeks.watch();
 setInterval(watch, 1000);
 const lost = () => {
   broken = true;
