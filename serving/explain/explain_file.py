@@ -5,20 +5,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, get_args
 
 from loopwright.serving.controller_file import DIGEST_KEY, EXPLAIN_SUFFIX
 from loopwright.serving.errors import ArtifactError
+from loopwright.serving.explain.explanation import Cause
 from loopwright.serving.manifest import INPUTS, Manifest, strictly
 
 EXPLAIN_KEY = "loopwright.explain"
 EXPLAIN_SCHEMA = 1
-CAUSES = frozenset(
-    {
-        "set_point", "range_low", "range_high", "disturbance", "load", "cost", "rest", "mv_low", "mv_high", "max_move",
-        "not_in_use", "plan",
-    }
-)  # fmt: skip
+CAUSES = frozenset(get_args(Cause))
 MOST_PARTS = 10_000  # of a move
 
 

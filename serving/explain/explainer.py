@@ -76,12 +76,13 @@ class Explainer:
         dv: ArrayLike | None = None,
         operate: ArrayLike | None = None,
         fresh: ArrayLike | None = None,
+        ahead: ArrayLike | None = None,
     ) -> Explanation:
         """The explanation of the step that the controller makes of these inputs, which are those of its ``step``.
 
         The courses of CVs have all samples of the horizon, those of MVs the moves of the plan. Raises as ``step`` does.
         """
-        given = _Given(sp, pv, mv_applied, state, dv, operate, fresh)
+        given = _Given(sp, pv, mv_applied, state, dv, operate, fresh, ahead)
         return self._explanation(self._looked(given), given)
 
     def what_if(
@@ -95,6 +96,7 @@ class Explainer:
         dv: ArrayLike | None = None,
         operate: ArrayLike | None = None,
         fresh: ArrayLike | None = None,
+        ahead: ArrayLike | None = None,
     ) -> WhatIf:
         """What the law would do after ``changes``, beside what it does without them; nothing is set.
 
@@ -103,7 +105,7 @@ class Explainer:
         ContractError for an unknown name, LoopError for a set point and ContractError for another value that is not
         allowed; else as ``step``.
         """
-        given = _Given(sp, pv, mv_applied, state, dv, operate, fresh)
+        given = _Given(sp, pv, mv_applied, state, dv, operate, fresh, ahead)
         return WhatIf(dict(changes), self._run(given), self._run(self._changed(given, changes)))
 
     def changed_inputs(
@@ -126,7 +128,11 @@ class Explainer:
 
     def _changed(self, given: _Given, changes: Mapping[str, float]) -> _Given:
         sp, operate = self.changed_inputs(changes, given.sp, given.operate)
-        return given._replace(sp=sp, operate=operate)
+        if given.ahead is None or self.manifest.ahead is None:
+            return given._replace(sp=sp, operate=operate)
+        later = np.array(given.ahead, dtype=np.float64).reshape(self.manifest.ahead.horizon, -1)
+        later[:, [i for i, s in enumerate(self.manifest.sp) if s.name in changes]] = 0.0  # it ends their courses
+        return given._replace(sp=sp, operate=operate, ahead=later.ravel())
 
     # ------------------------------------------------------------------ the graph
     def _looked(self, given: _Given) -> dict[str, Array]:
@@ -184,17 +190,29 @@ class Explainer:
     def _run(self, given: _Given) -> Explanation:
         """The closed loop over the law's model from here: moves of the first step, courses of all."""
         n, outputs, period_s = self.explains.horizon, self.explains.outputs, self.manifest.period_s
-        first = found = self._looked(given)
+        at_first, first = given, self._looked(given)
+        found = first
         ys, mvs = [found["y"][:outputs]], [found["mv"]]
         pv = np.array(given.pv, dtype=np.float64, ndmin=1)
         for _ in range(n - 1):
             pv[:outputs] = ys[-1]
+            given = self._later(given)
             found = self._looked(given._replace(pv=pv, mv_applied=mvs[-1], state=found["state_next"], fresh=None))
             ys.append(found["y"][:outputs])
             mvs.append(found["mv"])
         ahead, starts = (tuple(period_s * (k + i) for k in range(n)) for i in (1, 0))
         courses = self._courses(ahead, np.array(ys), starts, np.array(mvs))
-        return Explanation(period_s, courses, self._moves(first, given))
+        return Explanation(period_s, courses, self._moves(first, at_first))
+
+    def _later(self, given: _Given) -> _Given:
+        """The inputs a sample on, of what is known to come: the last known values stay."""
+        known = self.manifest.ahead
+        if given.ahead is None or known is None:
+            return given
+        n_sp, rows = len(self.manifest.sp), np.asarray(given.ahead, dtype=np.float64).reshape(known.horizon, -1)
+        sp = np.array(given.sp, dtype=np.float64, ndmin=1) + rows[0, :n_sp]
+        dv = None if given.dv is None else np.array(given.dv, dtype=np.float64, ndmin=1) + rows[0, n_sp:]
+        return given._replace(sp=sp, dv=dv, ahead=(np.vstack([rows[1:], rows[-1:]]) - rows[0]).ravel())
 
 
 class _Given(NamedTuple):
@@ -207,6 +225,7 @@ class _Given(NamedTuple):
     dv: ArrayLike | None
     operate: ArrayLike | None
     fresh: ArrayLike | None
+    ahead: ArrayLike | None
 
 
 def _agree(session: Any, inputs: Mapping[str, int], outputs: Mapping[str, int]) -> None:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 Cause: TypeAlias = Literal[
-    "set_point", "range_low", "range_high", "disturbance", "load", "cost", "rest", "mv_low", "mv_high", "max_move",
-    "not_in_use", "plan",
+    "set_point", "range_low", "range_high", "disturbance", "forecast", "load", "cost", "rest", "mv_low", "mv_high",
+    "max_move", "not_in_use", "plan",
 ]  # fmt: skip
 
 HOLDING = frozenset({"mv_low", "mv_high", "max_move", "not_in_use"})  # causes that hold an MV back

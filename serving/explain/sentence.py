@@ -47,6 +47,7 @@ def words(part: MovePart, news: Mapping[str, float]) -> str:
         "range_low": f"{name} towards its low limit",
         "range_high": f"{name} towards its high limit",
         "disturbance": f"{name} {'rose' if up else 'fell'}",
+        "forecast": f"{name} as it is to come",
         "load": f"something not measured {'raises' if up else 'lowers'} {name}",
         "cost": f"cost of {name}",
         "rest": f"{name} to its resting value",

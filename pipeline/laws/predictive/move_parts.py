@@ -63,6 +63,7 @@ class ExplainedPredictive(nn.Module):
     y_centre: Tensor  # (N n_o,) [pv]
     y_scale: Tensor  # (N n_o,) [pv]
     dv_scale: Tensor  # (n_dv,) [dv]
+    known_to: Tensor  # (n_dv, N n_dv) ones of the measured disturbances up to one, at all samples
     near: Tensor  # (1,) to a bound
     tiny: Tensor  # (1,)
     zero: Tensor  # (1,)
@@ -90,43 +91,56 @@ class ExplainedPredictive(nn.Module):
         row = len(signals.sp) + len(signals.pv)
         slopes = law.inputs.matrix[row : row + self.n_dv, column : column + self.n_dv]
         self.register_buffer("dv_scale", 1 / slopes.diagonal())
+        self.forecasts = law.known is not None and self.n_dv > 0
+        self.register_buffer("known_to", torch.tril(torch.ones(self.n_dv, self.n_dv).double()).repeat(1, horizon))
         hold_numbers(self, near=AT_BOUND, tiny=TINY_EXCESS, zero=0.0, one=1.0)
 
     @property
     def parts(self) -> tuple[tuple[str, str], ...]:
         """Cause and signal of each part of a move, in the order of the output ``parts``."""
         signals = self.signals
-        pv, mv = [s.name for s in signals.pv[: self.n_o]], [s.name for s in signals.mv]
+        pv, dv, mv = ([s.name for s in of] for of in (signals.pv[: self.n_o], signals.dv, signals.mv))
         groups = (
-            ("set_point", pv), ("range_low", pv), ("range_high", pv), ("disturbance", [s.name for s in signals.dv]),
-            ("load", pv), ("cost", [*pv, *mv]), ("rest", mv), ("mv_low", mv), ("mv_high", mv), ("max_move", mv),
-            ("not_in_use", mv), ("plan", [""]),
+            ("set_point", pv), ("range_low", pv), ("range_high", pv), ("disturbance", dv),
+            ("forecast", dv if self.forecasts else []), ("load", pv), ("cost", [*pv, *mv]), ("rest", mv),
+            ("mv_low", mv), ("mv_high", mv), ("max_move", mv), ("not_in_use", mv), ("plan", [""]),
         )  # fmt: skip
         return tuple((cause, name) for cause, names in groups for name in names)
 
     def forward(
-        self, sp: Tensor, pv: Tensor, dv: Tensor, mv_applied: Tensor, state: Tensor, operate: Tensor, fresh: Tensor
+        self,
+        sp: Tensor,
+        pv: Tensor,
+        dv: Tensor,
+        mv_applied: Tensor,
+        state: Tensor,
+        operate: Tensor,
+        fresh: Tensor,
+        ahead: Tensor | None = None,
     ) -> Explained:
         """The explained step; shapes as of ``Predictive.forward``."""
         law = self.law
-        problem = law.problem(sp, pv, dv, mv_applied, state, operate, fresh)
-        by = problem.operated
+        problem = law.problem(sp, pv, dv, mv_applied, state, operate, fresh, ahead)
+        by, forecast = problem.operated, problem.forecast
         assert by is not None  # a law with `operate`
-        last = law.planner.last_pass(problem.start, problem.wanted, problem.applied, problem.plan, by)
+        last = law.planner.last_pass(problem.start, problem.wanted, problem.applied, problem.plan, by, forecast)
         mv, state_next, _ = law.answer(problem, last.plan, law.planner.ahead(last))
-        y = self.y_centre + self.y_scale * law.planner.horizon(problem.start, last.plan + by.off).y
+        y = self.y_centre + self.y_scale * law.planner.horizon(problem.start, last.plan + by.off, forecast).y
         z = law.mv_middle + law.mv_half * last.plan.reshape(*last.plan.shape[:-2], -1, self.n_mv)
-        runs, news = self._runs(problem, last, by)
+        runs, news = self._runs(problem, last, by, ahead)
         move = mv - problem.stands
         parts = self._parts(problem, last, by, self._pulls(last, by, runs))
         parts = self._finished(parts, problem, by, move).flatten(-2)
         return Explained(mv, state_next, y.squeeze(-2), z.flatten(-2), move, parts, news)
 
-    def _runs(self, problem: PlanProblem, last: LastPass, by: OperatedPlan) -> tuple[list[Tensor], Tensor]:
+    def _runs(
+        self, problem: PlanProblem, last: LastPass, by: OperatedPlan, ahead: Tensor | None
+    ) -> tuple[list[Tensor], Tensor]:
         """The free runs (..., 1, N n_o) with the MVs held, and the news.
 
-        The first run is the predicted one; then each has one measured disturbance more as it is now, and then the
-        correction by one reading more; the last is that of the step.
+        The first run is the predicted one; then each has one measured disturbance more as it is now, then one more with
+        its forecast, where the law reads them, and then the correction by one reading more; the last is that of the
+        step.
         """
         observer, kept, n_a = self.law.observer, problem.kept, self.law.observer.n_a
         started = kept["started"]
@@ -143,16 +157,29 @@ class ExplainedPredictive(nn.Module):
         for i in range(self.n_dv):
             now = torch.cat([held[..., :0], measured[..., : i + 1], held[..., i + 1 :]], dim=-1)
             starts.append(torch.cat([predicted, now], dim=-1))
+        offsets = self._forecasts(ahead)
+        starts += [starts[-1]] * len(offsets)
         for o in range(self.n_o - 1):
             predicted = predicted + surprise[..., o : o + 1] * gains[..., o : o + 1, :]
             starts.append(torch.cat([predicted, measured], dim=-1))
         every = torch.stack(starts)  # (runs, ..., 1, n_start)
         plan = (last.before + by.off).expand(*every.shape[:-1], -1)
-        free = self.law.planner.horizon(every, plan).y
+        horizon, offset = self.law.planner.horizon, None
+        if offsets:
+            held_offset = horizon.run.offset.expand_as(offsets[0])
+            offset = torch.stack([*[held_offset] * (1 + self.n_dv), *offsets, *[offsets[-1]] * (self.n_o - 1)])
+        free = horizon(every, plan, offset).y
         found = [*(y.squeeze(0) for y in torch.split(free, 1)), last.run.y]
         moved = (by.stands - last.before) @ last.run.slopes
         news = torch.cat([self.dv_scale * (measured - held), self.y_scale[: self.n_o] * surprise], dim=-1)
         return [y + moved for y in found], news.squeeze(-2)
+
+    def _forecasts(self, ahead: Tensor | None) -> list[Tensor]:
+        """The horizon's offset with the forecast of one measured disturbance, of two, and so on; none without them."""
+        if not self.forecasts or self.law.known is None or ahead is None:
+            return []
+        _, later = self.law.known(ahead)
+        return [self.law.planner.horizon.forecast(later * self.known_to[i]) for i in range(self.n_dv)]
 
     def _pulls(self, last: LastPass, by: OperatedPlan, runs: list[Tensor]) -> tuple[Tensor, Tensor]:
         """The terms (..., K, m) of the minimum, one a part, and the curvature H (..., m, m)."""
