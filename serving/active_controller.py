@@ -73,7 +73,7 @@ class AdaptedController(Controller):
         return step._replace(mv=np.array(mv))
 
     def _known_ahead(self, ahead: ArrayLike) -> Array:
-        """What is to come of the controller's own set points and measured disturbances."""
+        """The numbers of ``ahead`` of the controller's own set points and measured disturbances."""
         n_sp, loops = len(self.manifest.sp), len(self.manifest.sp) + len(self.manifest.dv)
         own = [*range(n_sp), *(n_sp + place for place in self._dv)]
         return np.asarray(ahead, dtype=np.float64).reshape(-1, loops)[:, own].ravel()

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, TypeAlias, get_args
 
 from loopwright.serving.errors import ArtifactError
 from loopwright.serving.fields import MAX_DIGITS, refused, shown
-from loopwright.serving.preview.ahead import Ahead
+from loopwright.serving.preview.ahead import AheadInput
 from loopwright.serving.words import ACTS
 
 MANIFEST_SCHEMA = 1  # of the manifest: a runtime refuses another
@@ -203,7 +203,7 @@ class Manifest:
     provenance: dict[str, Any] = field(default_factory=dict)
     evidence: dict[str, Any] = field(default_factory=dict)
     operate: tuple[OperateEntry, ...] = ()
-    ahead: Ahead | None = None
+    ahead: AheadInput | None = None
 
     def __post_init__(self) -> None:
         for name in ("sp", "pv", "dv", "mv"):
@@ -310,7 +310,7 @@ class Manifest:
                 provenance=_dict(row["provenance"]),
                 evidence=_dict(row["evidence"]),
                 operate=tuple(OperateEntry.from_dict(_dict(e)) for e in _list(row.get("operate", []))),
-                ahead=Ahead.from_dict(_dict(row["ahead"])) if "ahead" in row else None,
+                ahead=AheadInput.from_dict(_dict(row["ahead"])) if "ahead" in row else None,
                 **signals,
             )
         except KeyError as error:

@@ -22,7 +22,7 @@ from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopwrightError
 from loopwright.serving.manifest import INPUTS, SENSITIVE, Manifest, Signal
 from loopwright.serving.operating import Operate
-from loopwright.serving.preview.ahead import Ahead
+from loopwright.serving.preview.ahead import AheadInput
 from loopwright.serving.preview.differences import Differences
 
 GATE_STEPS = 1_000  # of the loop in which a law and its file are compared
@@ -285,7 +285,7 @@ KNOWN_ANEW = 1 / 10  # probability a step that somebody gives another course
 UNKNOWN = 0.3  # of courses that say nothing
 
 
-def _known_future(ahead: Ahead, rng: np.random.Generator) -> Callable[[Array], Array]:
+def _known_future(ahead: AheadInput, rng: np.random.Generator) -> Callable[[Array], Array]:
     """Courses within the signals' ranges, a step or straight over the horizon, as differences from present values."""
     differences, n = Differences(ahead), len(ahead.signals)
     low, high = (np.array([getattr(s, end) for s in ahead.signals]) for end in ("low", "high"))

@@ -18,7 +18,7 @@ from loopwright.serving.controller import Controller, Step
 from loopwright.serving.errors import OutputError, SampleError
 from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.operating import Operate
-from loopwright.serving.preview.ahead import Ahead
+from loopwright.serving.preview.ahead import AheadInput
 from loopwright.serving.preview.differences import Differences
 
 Array: TypeAlias = NDArray[np.float64]
@@ -200,7 +200,7 @@ class _Steering:
         values = {"operate": self.at, "fresh": fresh}
         return replace(given, inputs=given.inputs | {n: v for n, v in values.items() if n in self.manifest.inputs})
 
-    def _to_come(self, ahead: Ahead, given: StepInputs) -> Array:
+    def _to_come(self, ahead: AheadInput, given: StepInputs) -> Array:
         """Set points and disturbances that step or run straight to a value within their ranges; zeros by and by."""
         rng, n = self.known, len(ahead.signals)
         present = np.concatenate([given.inputs["sp"], given.inputs["dv"]])

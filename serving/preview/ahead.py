@@ -25,9 +25,10 @@ LONGEST_AHEAD = 10_000  # samples of a horizon: far above those of any law, and 
 
 @dataclass(frozen=True, slots=True)
 class AheadSignal:
-    """A signal whose future a law reads, and the range [unit] within which its values may lie.
+    """A signal whose future a law reads.
 
-    ``group`` is sp for a set point and dv for a measured disturbance.
+    ``group`` is sp for a set point and dv for a measured disturbance. ``signal`` is its name, ``unit`` its unit; all
+    its values lie within ``low`` .. ``high``.
     """
 
     group: AheadGroup
@@ -46,8 +47,8 @@ class AheadSignal:
 
 
 @dataclass(frozen=True, slots=True)
-class Ahead:
-    """What a law reads of the future: ``horizon`` N samples, ``period_s`` apart, of each of ``signals``.
+class AheadInput:
+    """The future that a law reads: ``horizon`` N samples, ``period_s`` apart, of each of ``signals``.
 
     ArtifactError for a horizon that cannot be, or for signals that are missing, listed twice, or not the set points
     first.
@@ -84,19 +85,19 @@ class Ahead:
                 f"the manifest's ahead must list all set points and then all measured disturbances: {listed}"
             )
 
-    def with_disturbances(self, signals: Iterable[Signal]) -> Ahead:
+    def with_disturbances(self, signals: Iterable[Signal]) -> AheadInput:
         """The same set points with these measured disturbances."""
         sp = [s for s in self.signals if s.group == "sp"]
         dv = [AheadSignal("dv", s.name, s.unit, s.low, s.high) for s in signals]
         return replace(self, signals=(*sp, *dv))
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON-ready values."""
+        """The same as JSON-ready values."""
         return asdict(self) | {"signals": [asdict(s) for s in self.signals]}
 
     @classmethod
     def from_dict(cls, row: Mapping[str, Any]) -> Self:
-        """What ``to_dict`` wrote; TypeError or ValueError if it is none."""
+        """The future that ``to_dict`` wrote; TypeError or ValueError if it is none."""
         _require_keys(row, [f.name for f in fields(cls)], "ahead")
         if type(row["horizon"]) is not int:
             raise TypeError(f"ahead has the horizon {row['horizon']!r}; it must be an integer")

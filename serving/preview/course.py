@@ -20,7 +20,7 @@ Array: TypeAlias = NDArray[np.float64]
 Points: TypeAlias = Sequence[tuple[float, float]]
 """Points (time [s] from now, value in the signal's unit) of one signal."""
 
-MOST_POINTS = 10_000  # of a signal: a month of five minutes
+MOST_COURSE_POINTS = 10_000  # of a signal: a month of five minutes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,8 +191,8 @@ def _pairs(name: str, points: Any) -> list[tuple[float, float]]:
     if isinstance(points, str | Mapping) or not isinstance(points, Iterable):
         raise LoopError(f"the course of {name} is {shown(points)}; it needs points (time in s from now, value)")
     rows = list(points)
-    if not 1 <= len(rows) <= MOST_POINTS:
-        raise LoopError(f"the course of {name} has {len(rows)} points; it must have 1 to {MOST_POINTS}")
+    if not 1 <= len(rows) <= MOST_COURSE_POINTS:
+        raise LoopError(f"the course of {name} has {len(rows)} points; it must have 1 to {MOST_COURSE_POINTS}")
     for row in rows:
         if not isinstance(row, Sequence) or isinstance(row, str) or len(row) != 2 or not all(map(_is_number, row)):
             raise LoopError(f"the course of {name} has the point {shown(row)}; it needs a time in s and a value")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopwright.serving.errors import ContractError
-from loopwright.serving.preview.ahead import Ahead
+from loopwright.serving.preview.ahead import AheadInput
 from loopwright.serving.ranges import numbers
 
 Array: TypeAlias = NDArray[np.float64]
@@ -19,7 +19,7 @@ ROUNDING = 1e-9  # share of a range by which a sum of a present value and a diff
 class Differences:
     """Differences (N n,) of the n signals of ``ahead`` from their present values, at N samples to come."""
 
-    def __init__(self, ahead: Ahead) -> None:
+    def __init__(self, ahead: AheadInput) -> None:
         self.ahead = ahead
         self.none: Array = np.zeros(ahead.size)  # all stay as they are
         self._low, self._high = (np.array([getattr(s, end) for s in ahead.signals]) for end in ("low", "high"))
@@ -61,8 +61,8 @@ class Differences:
             return False
         rows = values.reshape(self.ahead.horizon, -1)
         least, most = (rows.min(axis=0) + present).tolist(), (rows.max(axis=0) + present).tolist()
-        ends = zip(self.ahead.signals, least, most, strict=True)
-        return all(s.low <= low and high <= s.high for s, low, high in ends)
+        ranges = zip(self.ahead.signals, least, most, strict=True)
+        return all(s.low <= low and high <= s.high for s, low, high in ranges)
 
     def allowed(self, given: Array, present: Array) -> NDArray[np.bool_]:
         """Whether each difference (..., N n) may be given beside the present values (..., n)."""

@@ -17,7 +17,7 @@ from loopwright.serving import ArtifactError, ContractError, Controller, SampleE
 from loopwright.serving.conformance.steps import answered
 from loopwright.serving.first_steps import take
 from loopwright.serving.manifest import Manifest
-from loopwright.serving.preview.ahead import Ahead, AheadSignal
+from loopwright.serving.preview.ahead import AheadInput, AheadSignal
 from loopwright.serving.preview.differences import Differences
 from loopwright.serving.vectorized_controller import VectorizedController
 
@@ -161,7 +161,7 @@ def test_its_first_steps_are_taken_with_all_that_is_to_come(operated_previewing:
 
 
 def test_differences_end_at_the_ranges() -> None:
-    ahead = Ahead(2, 1.0, (AheadSignal("sp", "a", "K", 0.0, 10.0), AheadSignal("dv", "b", "K", 0.0, 10.0)))
+    ahead = AheadInput(2, 1.0, (AheadSignal("sp", "a", "K", 0.0, 10.0), AheadSignal("dv", "b", "K", 0.0, 10.0)))
     found = Differences(ahead).within(np.array([[1.0, 5.0], [-9.0, 9.0]]), np.array([4.0, 11.0]))
     np.testing.assert_array_equal(found, [1.0, 0.0, -4.0, 0.0])
     assert not Differences(ahead).within(np.ones((2, 2)), np.array([np.nan, np.nan])).any()

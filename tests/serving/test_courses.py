@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from loopwright.serving import Controller, ControlLoop, LoopError, Mode, Sample, VirtualClock
-from loopwright.serving.preview.course import MOST_POINTS, Courses
+from loopwright.serving.preview.course import MOST_COURSE_POINTS, Courses
 
 pytest_plugins = ["small_laws", "operated_files", "course_files"]
 N, PERIOD = 12, 1.0
@@ -173,7 +173,7 @@ def test_another_controller_gets_its_own_horizon(previewing: Controller, operate
         {"y0": [(0, 3.1)]},
         {"d0": [(0, 0.0), (5, -1.1)]},
         {"y0": [(-5, 0.0), (-1, 1.0)]},
-        {"y0": [(k, 0.0) for k in range(MOST_POINTS + 1)]},
+        {"y0": [(k, 0.0) for k in range(MOST_COURSE_POINTS + 1)]},
     ],
 )
 def test_a_course_that_cannot_be_is_refused_and_changes_nothing(previewing: Controller, wrong: Any) -> None:

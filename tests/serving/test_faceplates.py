@@ -89,19 +89,20 @@ def test_the_history_of_operate_has_each_change_once_and_begins_anew_with_a_cont
     operated: Controller, otherwise_operated: Controller
 ) -> None:
     loop = loop_of(operated)
-    monitor = Monitor(operated.manifest, started_s=0.0)
+    week = SimpleNamespace(week="2026-W48", counts={})
+    watching: Any = SimpleNamespace(monitor=Monitor(operated.manifest, started_s=0.0), weekly=week)
     before: Snapshot | None = None
     for k in range(8):
         if k in {3, 5}:
             loop.set_operate({"valve.high": 90.0 - k})
         stepped = loop.controller
         command = loop.scan(PLANT)
-        before = Snapshot.of(loop, monitor, (PLANT, command, float(k)), stepped, (0, 0), before)
+        before = Snapshot.of(loop, watching, (PLANT, command, float(k)), stepped, (0, 0), before)
     assert [at for at, _ in before.operated] == [0.0, 3.0, 5.0]
     assert [of[6] for _, of in before.operated] == [100.0, 87.0, 85.0]
     assert before.stepped_s == 7.0
     refused = loop.miss("no sample")
-    before = Snapshot.of(loop, monitor, (None, refused, 8.0), loop.controller, (0, 1), before)
+    before = Snapshot.of(loop, watching, (None, refused, 8.0), loop.controller, (0, 1), before)
     assert before.stepped_s == 7.0  # the law was not stepped
 
 

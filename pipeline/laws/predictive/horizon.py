@@ -301,7 +301,7 @@ def inputs(moves: Moves, mv_of: Scaling, p: Named) -> Tensor:
 
 
 def later_of(model: Identified, loads: Loads, moves: Moves, run: Callable[[Named], Named]) -> Tensor:
-    """What a unit of each p["later"] adds to the results of ``run``, (N n_dv, their size)."""
+    """Answers of the results of ``run`` to a unit of each p["later"], (N n_dv, their size)."""
     rest = {name: torch.zeros(n, dtype=torch.float64) for name, n in layout_of(model, loads, moves).items()}
 
     def formulas(p: Named) -> Named:

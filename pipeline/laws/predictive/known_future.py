@@ -7,13 +7,13 @@ from torch import Tensor, nn
 
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Signals
-from loopwright.serving.preview.ahead import Ahead, AheadSignal
+from loopwright.serving.preview.ahead import AheadInput, AheadSignal
 
 
-def ahead_of(signals: Signals, horizon: int) -> Ahead:
+def ahead_of(signals: Signals, horizon: int) -> AheadInput:
     """The input of a law over these signals: all set points, then all measured disturbances, over N samples."""
     listed = [("sp", s) for s in signals.sp] + [("dv", s) for s in signals.dv]
-    return Ahead(
+    return AheadInput(
         horizon,
         signals.period_s,
         tuple(AheadSignal(group, s.name, s.unit, s.low, s.high) for group, s in listed),  # type: ignore[arg-type]
@@ -34,7 +34,7 @@ class KnownFuture(nn.Module):
     dv_at: Tensor  # (N n_dv,)
     by_v: Tensor  # (N n_dv,) 1/v_scale
 
-    def __init__(self, ahead: Ahead, model: Identified, n_o: int) -> None:
+    def __init__(self, ahead: AheadInput, model: Identified, n_o: int) -> None:
         super().__init__()
         n_sp, n = sum(s.group == "sp" for s in ahead.signals), len(ahead.signals)
         rows = torch.arange(ahead.horizon).unsqueeze(-1) * n

@@ -409,7 +409,7 @@ class Predictive(ControlLaw):
         return mv, state_next, torch.cat(info, dim=-1).squeeze(-2)
 
     def _later(self, ahead: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """What ``ahead`` adds to the set points over the horizon, and the horizon's offset under its disturbances."""
+        """Changes by ``ahead`` of the set points over the horizon, and the horizon's offset under its disturbances."""
         if self.known is None or ahead is None:
             return None, None
         later, dv = self.known(ahead)
