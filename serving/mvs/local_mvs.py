@@ -19,7 +19,7 @@ from loopwright.serving.mv_readback import EQUAL_COMMANDS, SAME_READ_BACK
 Array: TypeAlias = NDArray[np.float64]
 
 ELSEWHERE_PERIODS = 20.0  # periods: a valve that lags or waits has begun to move long before
-FORGETS = 0.02  # of a scan elsewhere, for each scan there: a law that goes on from the read-back is seldom far off it
+FORGIVEN = 0.02  # of a scan elsewhere, for each scan there: a law that goes on from the read-back is seldom far off it
 
 
 class LocalMvs:
@@ -135,7 +135,7 @@ class LocalMvs:
         far = judged & (np.abs(off) > self.near)
         goes = (np.abs(asked) > self.near) & (got * np.sign(asked) > self._same)
         there = judged & ~far & (self._rested >= EQUAL_COMMANDS)
-        self._count = np.where(far, self._count + 1.0, np.maximum(self._count - FORGETS, 0.0))
+        self._count = np.where(far, self._count + 1.0, np.maximum(self._count - FORGIVEN, 0.0))
         self._count[goes | there | ~judged] = 0.0
         for i in np.flatnonzero(self._count >= self._most).tolist():
             s = self._signals[i]

@@ -28,14 +28,14 @@ class Steered:
 
     @classmethod
     def of(cls, loop: ControlLoop) -> Self:
-        """As a loop stands now."""
+        """The values of a loop now."""
         controller = loop.controller
         sp = {s.name: v for s, v in zip(controller.manifest.sp, loop.sp.tolist(), strict=True)}
         return cls(controller.sha256, sp, loop.wishes)
 
     @classmethod
     def before(cls, journal: Path) -> Self:
-        """As the last loop of a journal left it; empty where the journal does not tell."""
+        """The values that the last loop of a journal ended with; empty where it does not tell."""
         kept: Any = None
         with suppress(LoopError, sqlite3.Error, ValueError, RecursionError), closing(JournalReader(journal)) as reader:
             kept = json.loads(reader.learnt(STEERED) or "{}")

@@ -1,4 +1,4 @@
-"""What a loop's journal keeps of its operators' values, and what another loop makes of it."""
+"""Operators' values in a loop's journal, and another loop that takes them back."""
 
 from __future__ import annotations
 
