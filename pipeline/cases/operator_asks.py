@@ -1,4 +1,4 @@
-"""What operators ask at a sample of a test, as arrays by signal, and the best steady state for it."""
+"""Operators' wishes at the end of a test, as arrays by signal, and the best steady state for them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LAST_RANK = 4.0  # of a PV for which the law has no rank: its range is out of us
 
 
 def asked_at(course: OperatedCourse, plant: Simulator, stands: Array | None = None) -> Asked:
-    """What is asked at the end of a course.
+    """The wishes at the end of a course.
 
     An MV out of use stays where it ``stands`` (n_mv,), or at the MVs of the plant's start. A PV without entries is out
     of use.

@@ -21,7 +21,7 @@ WIDE_STATE = 1e3  # scaled: no rest is sought beyond it
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What operators ask of a rest; arrays by PV (n_y,) and by MV (n_mv,), in their units.
+    """Operators' wishes for a rest; arrays by PV (n_y,) and by MV (n_mv,), in their units.
 
     ``y_use`` and ``track`` are 0 or 1, ``rank`` is kept first where it is smallest. An MV ``held`` stays at its value,
     NaN for one that is in use. Costs count per unit and period.

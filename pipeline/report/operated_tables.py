@@ -57,7 +57,7 @@ def _outside(law: str, tests: Tests) -> Iterator[CheckedStatement]:
 
 
 def _wider(worst: RangeResult, result: OperatedResult) -> str:
-    """What to do about a range that is not kept."""
+    """The remedy for a range that is not kept."""
     if hasty := _hasty(result):
         return hasty
     if clamped := _clamped(result):
@@ -86,7 +86,7 @@ def _gains(law: str, tests: Tests) -> Iterator[CheckedStatement]:
 
 
 def _calmer(result: OperatedResult) -> str:
-    """What to do about a profit that is not made."""
+    """The remedy for a profit that is not made."""
     if hasty := _hasty(result):
         return hasty
     if clamped := _clamped(result):
@@ -95,7 +95,7 @@ def _calmer(result: OperatedResult) -> str:
 
 
 def _hasty(result: OperatedResult) -> str:
-    """What to do about an MV that travels very far; empty where none does."""
+    """The remedy for an MV that travels very far; empty where none does."""
     worst = max(result.mvs, key=lambda one: one.travel_share)
     if worst.travel_share <= HASTY_TRAVEL:
         return ""
