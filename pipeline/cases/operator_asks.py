@@ -1,4 +1,4 @@
-"""What operators ask at a sample of a test, as arrays by signal, and the best steady state for it."""
+"""Operators' wishes at the end of a test, as arrays by signal, and the best steady state for them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from loopwright.pipeline.evaluation.case import Array
-from loopwright.pipeline.optimal.economic import Asked, BestRest, RestProblem
+from loopwright.pipeline.optimal.economic import BestRest, RestProblem, RestWishes
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.operator_changes import OperatedCourse
@@ -16,8 +16,8 @@ from loopwright.pipeline.simulation.scenario import Scenario
 LAST_RANK = 4.0  # of a PV for which the law has no rank: its range is out of use
 
 
-def asked_at(course: OperatedCourse, plant: Simulator, stands: Array | None = None) -> Asked:
-    """What is asked at the end of a course.
+def asked_at(course: OperatedCourse, plant: Simulator, stands: Array | None = None) -> RestWishes:
+    """The wishes at the end of a course.
 
     An MV out of use stays where it ``stands`` (n_mv,), or at the MVs of the plant's start. A PV without entries is out
     of use.
@@ -31,7 +31,7 @@ def asked_at(course: OperatedCourse, plant: Simulator, stands: Array | None = No
     pv_names, mv_names = tuple(s.name for s in pvs), tuple(s.name for s in mvs)
     nothing, none = [0.0] * len(pvs), [0.0] * len(mvs)
     use = of(mv_names, "use", [1.0] * len(mvs))
-    return Asked(
+    return RestWishes(
         y_use=of(pv_names, "use", nothing),
         track=of(pv_names, "track", nothing),
         y_low=of(pv_names, "low", [s.low for s in pvs]),

@@ -20,8 +20,8 @@ WIDE_STATE = 1e3  # scaled: no rest is sought beyond it
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """What operators ask of a rest; arrays by PV (n_y,) and by MV (n_mv,), in their units.
+class RestWishes:
+    """Operators' wishes for a rest; arrays by PV (n_y,) and by MV (n_mv,), in their units.
 
     ``y_use`` and ``track`` are 0 or 1, ``rank`` is kept first where it is smallest. An MV ``held`` stays at its value,
     NaN for one that is in use. Costs count per unit and period.
@@ -100,7 +100,7 @@ class RestProblem:
         problem: Any = {"x": ca.vertcat(x, z, s, t), "p": given, "f": cost, "g": bound}
         self._solver = ca.nlpsol("rest", "ipopt", problem, options)
 
-    def best(self, asked: Asked, sp: Array, p: Array, dv: Array, begin: tuple[Array, Array]) -> BestRest | None:
+    def best(self, asked: RestWishes, sp: Array, p: Array, dv: Array, begin: tuple[Array, Array]) -> BestRest | None:
         """The best rest under set points sp (n_sp,), parameters p (n_p,) and measured disturbances dv (n_dv,).
 
         ``begin`` is (state (n_x,), mv (n_mv,)) of a rest nearby, where the search starts. None where no rest is found.

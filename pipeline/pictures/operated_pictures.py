@@ -135,6 +135,6 @@ def _legend(loop: Loop, outside: bool) -> dict[str, Any]:
 
 
 def _caption(result: OperatedResult) -> str:
-    """What the picture is of, in words."""
+    """The choice of the loop, in words; empty where there is one."""
     count = len(result.loops)
-    return "" if count == 1 else f". Of {count} loops the one that was outside its ranges longest"
+    return "" if count == 1 else f". It is the one of {count} loops that was outside its ranges longest"

@@ -23,7 +23,7 @@ from loopwright.pipeline.report.own_acceptance import shipped_laws
 HASTY_TRAVEL = 5.0  # of an MV's range in one test: from here on calmer settings are the first thing to try
 OFTEN_CLAMPED = 0.2  # of the time at an operator's limit: then it is named as what stands in the way
 PERCENT_DIGITS = 6  # decimal places of a share in %: what is behind them is rounding
-DECIMALS = 9  # of a value in its unit: the solver's last digits are no distance
+VALUE_DECIMALS = 9  # of a value in its unit: the solver's last digits are no distance
 T = TypeVar("T")
 Tests = Mapping[str, OperatedResult]
 
@@ -57,7 +57,7 @@ def _outside(law: str, tests: Tests) -> Iterator[CheckedStatement]:
 
 
 def _wider(worst: RangeResult, result: OperatedResult) -> str:
-    """What to do about a range that is not kept."""
+    """The remedy for a range that is not kept."""
     if hasty := _hasty(result):
         return hasty
     if clamped := _clamped(result):
@@ -86,7 +86,7 @@ def _gains(law: str, tests: Tests) -> Iterator[CheckedStatement]:
 
 
 def _calmer(result: OperatedResult) -> str:
-    """What to do about a profit that is not made."""
+    """The remedy for a profit that is not made."""
     if hasty := _hasty(result):
         return hasty
     if clamped := _clamped(result):
@@ -95,7 +95,7 @@ def _calmer(result: OperatedResult) -> str:
 
 
 def _hasty(result: OperatedResult) -> str:
-    """What to do about an MV that travels very far; empty where none does."""
+    """The remedy for an MV that travels very far; empty where none does."""
     worst = max(result.mvs, key=lambda one: one.travel_share)
     if worst.travel_share <= HASTY_TRAVEL:
         return ""
@@ -289,4 +289,4 @@ def percent(share: float) -> str:
 
 def _value(value: float, unit: str, digits: int = 3) -> str:
     shown = "" if unit in NO_UNIT else f" {unit.replace('deg', '°')}"
-    return f"{number(round(value, DECIMALS), digits)}{shown}"
+    return f"{number(round(value, VALUE_DECIMALS), digits)}{shown}"

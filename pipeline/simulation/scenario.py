@@ -85,7 +85,7 @@ class Scenario:
         return self.dv
 
     def operated(self, entries: Sequence[OperateEntry]) -> OperatedCourse | None:
-        """What operators ask of a law with these ``entries`` at every sample; None where they change nothing."""
+        """The values of these ``entries`` of a law at every sample; None where operators change nothing."""
         if not self.operate:
             return None
         return OperatedCourse.of(entries, self.operate, self.samples, f"test {self.name!r}")

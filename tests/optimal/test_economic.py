@@ -10,7 +10,7 @@ from identified_models import random_model, scaled_model
 from scipy.optimize import linprog
 
 from loopwright.pipeline.models.identified.identified import Identified
-from loopwright.pipeline.optimal.economic import Asked, BestRest, RestProblem
+from loopwright.pipeline.optimal.economic import BestRest, RestProblem, RestWishes
 from loopwright.pipeline.plants.identified import IdentifiedArrays, IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.manifest import Signal
@@ -33,16 +33,16 @@ def plant_of(gains: np.ndarray, n_sp: int = 1, pole: float = 0.8, dead: int = 0)
     return IdentifiedPlant(Signals(1.0, pv[:n_sp], pv, (), mv), arrays_of(model), most_dead_time=dead)
 
 
-def asked(n_y: int, n_mv: int, **given: object) -> Asked:
+def asked(n_y: int, n_mv: int, **given: object) -> RestWishes:
     base = {
         "y_use": np.ones(n_y), "track": np.zeros(n_y), "y_low": np.full(n_y, -3.0), "y_high": np.full(n_y, 3.0),
         "rank": np.full(n_y, 3.0), "y_cost": np.zeros(n_y), "mv_low": -np.ones(n_mv), "mv_high": np.ones(n_mv),
         "mv_cost": np.zeros(n_mv), "held": np.full(n_mv, np.nan),
     }  # fmt: skip
-    return Asked(**{name: np.asarray(value, dtype=np.float64) for name, value in (base | given).items()})
+    return RestWishes(**{name: np.asarray(value, dtype=np.float64) for name, value in (base | given).items()})
 
 
-def best(plant: IdentifiedPlant, of: Asked, sp: float = 0.0) -> BestRest:
+def best(plant: IdentifiedPlant, of: RestWishes, sp: float = 0.0) -> BestRest:
     found = RestProblem(plant).best(of, np.array([sp]), plant.parameters(), plant.dv_nominal, plant.start)
     assert found is not None
     return found
