@@ -33,7 +33,7 @@ from loopwright.pipeline.commands.own_plant.knowledge import (
     stated_of,
 )
 from loopwright.pipeline.commands.own_plant.number_options import NUMBER_OPTIONS, limited, numbers_given
-from loopwright.pipeline.commands.own_plant.operated import Operated
+from loopwright.pipeline.commands.own_plant.operator_ranges import OperatorDefaults
 from loopwright.pipeline.commands.own_plant.replaced import (
     REFUSED,
     check_replaceable,
@@ -195,7 +195,7 @@ def _write(
     The record of ``export`` is left to stage `screen`; that of the experiment on a simulator is written here.
     """
     report, verdict, limits = found.report, found.report.verdict, list[str]()
-    operated = Operated.of(found.record, tags)
+    operated = OperatorDefaults.of(found.record, tags)
     if options.replace:
         tags, limits = limits_kept(name, tags)
     check_commands(found.record.mv_signals, tags)

@@ -1,4 +1,4 @@
-"""What operators of a new plant's predictive law start from: given in the table of tags, or shown by the record."""
+"""Numbers that operators of a new plant's predictive law start from: given in the table of tags, or shown by the record."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RANGE_DIGITS = 100.0  # steps of a range's width, at least, to which its ends ar
 
 
 @dataclass(frozen=True, slots=True)
-class Operated:
+class OperatorDefaults:
     """Defaults of ``operate`` by name, and a line for each that nobody gave. None: the plant's law has no ``operate``.
 
     ``controlled`` is the number of process variables with a set point where some have none by their role.
@@ -32,7 +32,7 @@ class Operated:
     controlled: int | None = None
 
     @classmethod
-    def of(cls, record: Record, tags: Sequence[Tag]) -> Operated:
+    def of(cls, record: Record, tags: Sequence[Tag]) -> OperatorDefaults:
         """The defaults for the signals of a record, of which ``tags`` hold the roles and the numbers that were given.
 
         There are none, and no ``operate``, where no tag is a constraint or an analyser or has such a number. A
