@@ -280,7 +280,7 @@ def _number(request: Request, name: str, otherwise: float | None = None) -> floa
 
 
 async def _json(request: Request) -> Any:
-    """What a request brings; HTTPException where it is late or no JSON."""
+    """The content of a request; HTTPException where it is late or no JSON."""
     try:
         async with asyncio.timeout(BODY_S):
             return json.loads(await _body(request))
