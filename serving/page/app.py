@@ -28,7 +28,7 @@ from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 from loopwright.serving.monitor.weekly_report import plain_rows, week_reports
 from loopwright.serving.page.access import LONGEST_BODY, Access
-from loopwright.serving.page.foresight import Foresight
+from loopwright.serving.page.foresight import LawForesight
 from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, Shared, shown
 from loopwright.serving.page.prometheus import metrics_text
 from loopwright.serving.page.trend import MOST_POINTS, trend
@@ -98,7 +98,7 @@ class PageApp:
         self._described = Shared(self._describe)
         self._told = -math.inf
         self._trends, self._waiting = asyncio.Semaphore(TRENDS), 0
-        self._foresight = Foresight(lambda: ask({"do": "inputs"}))
+        self._foresight = LawForesight(lambda: ask({"do": "inputs"}))
         self._explained = Shared(lambda: asyncio.to_thread(self._foresight.explained))
         self._looks, self._looking = asyncio.Semaphore(1), 0
 
@@ -234,14 +234,14 @@ class PageApp:
         return JSONResponse(answer, 409 if "error" in answer else 200)
 
     async def explain(self, _: Request) -> Response:
-        """What the law in charge predicts and plans, and the parts of its next moves; 404 where nobody can say so."""
+        """Courses that the law in charge predicts and plans, and the parts of its next moves; 404 without them."""
         try:
             return JSONResponse(await self._explained())
         except LoopwrightError as error:
             return JSONResponse({"error": first_line(error)}, 404)
 
     async def what_if(self, request: Request) -> Response:
-        """What it would do after some changes, which are not made."""
+        """Courses after some changes, which are not made, beside those without them."""
         wanted = await _json(request)
         changes = wanted.get("changes") if isinstance(wanted, dict) else None
         if not isinstance(changes, dict) or not changes:
@@ -288,7 +288,7 @@ def _number(request: Request, name: str, otherwise: float | None = None) -> floa
 
 
 async def _json(request: Request) -> Any:
-    """What a request brings; HTTPException where it is late or no JSON."""
+    """The content of a request; HTTPException where it is late or no JSON."""
     try:
         async with asyncio.timeout(BODY_S):
             return json.loads(await _body(request))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 View = dict[str, Any]
 
 
-class Foresight:
+class LawForesight:
     """Computes explanations of the law in charge; from any thread, one at a time.
 
     Parameters

@@ -65,7 +65,7 @@ def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tu
 
 
 def _operated(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tuple[str, str, str, Iterable[Any]]]:
-    """What operators have changed of the law, and which of its signals it does without; none of a law without them."""
+    """Values of ``operate``, and signals that the law does without; nothing of a law that does not read it."""
     entries = about.get("operate") or []
     if not entries:
         return

@@ -18,7 +18,7 @@ from loopwright.serving import Controller, ControlLoop, LoopError, Mode, Sample
 from loopwright.serving.active_controller import AdaptedController
 from loopwright.serving.errors import ContractError
 from loopwright.serving.monitor import Monitor
-from loopwright.serving.page.foresight import Foresight
+from loopwright.serving.page.foresight import LawForesight
 from loopwright.serving.page.prometheus import metrics_text
 from loopwright.serving.station.control import ask
 from loopwright.serving.station.views import VIEWS, Snapshot, inputs
@@ -204,7 +204,7 @@ def test_without_an_explain_graph_the_page_says_so_and_goes_on(operated: Control
 @pytest.mark.parametrize("value", [True, "1", None, float("nan"), [1.0]], ids=str)
 def test_a_what_if_of_no_number_is_refused_by_its_name(value: Any) -> None:
     with pytest.raises(ContractError) as refused:
-        Foresight(dict).what_if({"y0.low": value})
+        LawForesight(dict).what_if({"y0.low": value})
     assert refused.value.entry == "y0.low"
 
 
