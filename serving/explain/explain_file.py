@@ -12,7 +12,7 @@ from loopwright.serving.errors import ArtifactError
 from loopwright.serving.manifest import INPUTS, Manifest, strictly
 
 EXPLAIN_KEY = "loopwright.explain"
-EXPLAIN_SCHEMA = 1
+EXPLAIN_SCHEMA = 1  # of the explain manifest: a runtime refuses another
 CAUSES = frozenset(
     {
         "set_point", "range_low", "range_high", "disturbance", "load", "cost", "rest", "mv_low", "mv_high", "max_move",
