@@ -13,7 +13,7 @@ from loopwright.serving.explain.explanation import Cause
 from loopwright.serving.manifest import INPUTS, Manifest, strictly
 
 EXPLAIN_KEY = "loopwright.explain"
-EXPLAIN_SCHEMA = 1
+EXPLAIN_SCHEMA = 1  # of the explain manifest: a runtime refuses another
 CAUSES = frozenset(get_args(Cause))
 MOST_PARTS = 10_000  # of a move
 

@@ -19,7 +19,7 @@ from loopwright.serving.explain.sentence import sentence_of
 from loopwright.serving.fields import nearest, shown
 from loopwright.serving.graph.audit import audit
 from loopwright.serving.operating import Operate
-from loopwright.serving.ranges import within
+from loopwright.serving.ranges import numbers, within
 
 Array: TypeAlias = NDArray[np.float64]
 ROUNDING = 1e-13  # of an MV's range: a smaller part is none
@@ -122,6 +122,12 @@ class Explainer:
         for name, value in changes.items():
             if name in places:
                 i = places[name]
+                try:
+                    single = numbers(value).ndim == 0
+                except TypeError as error:
+                    raise ContractError(f"what-if: {name} {error}; it needs a number") from error
+                if not single:
+                    raise ContractError(f"what-if: {name} is {shown(value)}; it needs one number")
                 found[i] = within(value, self.manifest.sp[i : i + 1], "what-if's set point")[0]
         others = {name: value for name, value in changes.items() if name not in places}
         return found, entries.with_values(others, operate)

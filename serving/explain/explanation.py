@@ -13,7 +13,7 @@ Cause: TypeAlias = Literal[
 ]  # fmt: skip
 
 HOLDING = frozenset({"mv_low", "mv_high", "max_move", "not_in_use"})  # causes that hold an MV back
-STANDS_STILL = 1e-3  # of its largest part: a smaller move is what two parts leave of each other
+BALANCED_MOVE = 1e-3  # of its largest part: a smaller move is what two parts leave of each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class ExplainedMove:
         ``plan`` is no cause, and is only named where there is no other.
         """
         named = [p for p in self.parts if p.cause != "plan"] or [*self.parts]
-        if abs(self.move) <= STANDS_STILL * abs(self.parts[0].value):
+        if abs(self.move) <= BALANCED_MOVE * abs(self.parts[0].value):
             return next((p for p in named if p.cause in HOLDING), named[0])
         return next((p for p in named if p.value * self.move > 0), self.parts[0])
 

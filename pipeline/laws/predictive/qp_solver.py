@@ -65,7 +65,6 @@ LEAST_BEND = 1e-30  # of a cost along a direction: nothing moves
 MOST_LENGTH = 1e3  # sweeps that one step along a valley stands for
 AT_BOUND = 1e-9  # scaled: an entry this near a bound that does not move holds nothing back
 
-# --------------------------------------------------------------------------------------------------------- soft limits
 PRICE = 30.0  # of a scaled unit beyond a limit, in units of the largest weight of an error
 EPS = 0.03  # scaled: what lies beyond a limit by less counts by its square
 SOFT = 0.003  # scaled: where the curvature begins, so that the law has no jump at a limit
@@ -277,8 +276,7 @@ class Planner(nn.Module):
 
     def ahead(self, last: LastPass) -> Tensor:
         """The outputs (..., 1, n_o) at the next sample."""
-        n_o = self.n_cv
-        return last.run.y[..., :n_o] + (last.plan - last.before) @ last.run.slopes[..., :n_o]
+        return last.run.y[..., : self.n_cv] + (last.plan - last.before) @ last.run.slopes[..., : self.n_cv]
 
     def last_pass(
         self,
