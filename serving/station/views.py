@@ -80,8 +80,8 @@ class Snapshot:
         if not operated or operated[-1][1] != operate:
             operated = (*operated[1 - MOST_OPERATED :], (seen_s, operate))
         stepped_s = seen_s if command.law_mv is not None or before is None else before.stepped_s
-        past = (operate, operated, loop.stepped, stepped_s)
-        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, *past, *told)
+        of = (seen_s, sample, command, loop.controller, stepped, successor, loop.replaced)
+        return cls(*of, *counts, operate, operated, loop.stepped, stepped_s, *told)
 
 
 def about(station: Station) -> View:
