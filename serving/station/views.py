@@ -80,14 +80,16 @@ class Snapshot:
         if new is not None:
             successor = {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
         monitor, weekly = watching.monitor, watching.weekly
-        told = tuple(monitor.verdicts()), monitor.numbers(), weekly.week, dict(weekly.counts)
         operate = tuple(map(float, loop.operate))
         operated = () if before is None or before.controller is not loop.controller else before.operated
         if not operated or operated[-1][1] != operate:
             operated = (*operated[1 - MOST_OPERATED :], (seen_s, operate))
         stepped_s = seen_s if command.law_mv is not None or before is None else before.stepped_s
-        past = (operate, operated, loop.stepped, stepped_s, loop.courses.ends)
-        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, *past, *told)
+        of = (seen_s, sample, command, loop.controller, stepped, successor, loop.replaced)
+        verdicts, numbers = tuple(monitor.verdicts()), monitor.numbers()
+        week = (weekly.week, dict(weekly.counts))
+        past = (operate, operated, loop.stepped, stepped_s)
+        return cls(*of, *counts, *past, loop.courses.ends, verdicts, numbers, *week)
 
 
 def about(station: Station) -> View:
