@@ -110,7 +110,7 @@ def simulate_closed(
 
 
 def read_now(every: Sequence[int], k: int) -> NDArray[np.bool_]:
-    """The PVs (n_pv,) with a new reading at sample k: those of which ``every`` samples have gone by, all at first."""
+    """Whether each PV (n_pv,) has a new reading at sample k: every ``every`` samples, and all at first."""
     return np.array([k % n == 0 for n in every])
 
 

@@ -1,4 +1,4 @@
-"""Numbers that operators of a new plant's law start from: given in the table of tags, or shown by the record."""
+"""Numbers that operators of a new plant's predictive law start from, by the table of tags or the record."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """New readings of an analyser among the values that stand in between, and the rows that have one.
 
-An archive stores an analyser's last number until it has another one, or nothing at all. Neither is a reading. What is
-left out for a fault, as a spike is, is no reading either, and no row of the other signals goes with it.
+An archive stores an analyser's last number until it has another one, or nothing at all. Neither is a reading. A number
+that is left out for a fault, as a spike is, is no reading either, and no row of the other signals goes with it.
 """
 
 from __future__ import annotations
