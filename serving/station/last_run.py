@@ -80,7 +80,7 @@ class Steered:
             return
         sp = [self.sp.get(s.name, v) for s, v in zip(loop.controller.manifest.sp, loop.sp.tolist(), strict=True)]
         refused = []
-        acts: list[Callable[[], None]] = [lambda: loop.set_sp(sp)]
+        acts: list[Callable[[], object]] = [lambda: loop.set_sp(sp)]
         acts += [lambda: loop.set_operate(self.operate)] if self.operate else []
         for act in acts:
             try:

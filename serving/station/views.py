@@ -88,8 +88,8 @@ class Snapshot:
         of = (seen_s, sample, command, loop.controller, stepped, successor, loop.replaced)
         verdicts, numbers = tuple(monitor.verdicts()), monitor.numbers()
         week = (weekly.week, dict(weekly.counts))
-        past = (operate, operated, loop.stepped, stepped_s)
-        return cls(*of, *counts, *past, loop.courses.ends, verdicts, numbers, *week)
+        now = (loop.stepped, stepped_s, loop.courses.ends)
+        return cls(*of, *counts, operate, operated, *now, verdicts, numbers, *week)
 
 
 def about(station: Station) -> View:

@@ -383,8 +383,8 @@ class Predictive(ControlLaw):
             next_kept["level"] = levels[0]
         if past:
             next_kept |= {"sp": now["sp"], "sp_before": past[0]}
-        given = (start, wanted, applied, plan, operated, forecast)
-        return PlanProblem(*given, mean, now, kept, seen, boost, next_kept, stands, mv_applied)
+        asked = (start, wanted, applied, plan, operated, forecast)
+        return PlanProblem(*asked, mean, now, kept, seen, boost, next_kept, stands, mv_applied)
 
     def answer(self, problem: PlanProblem, plan: Tensor, soon: Tensor) -> Stepped:
         """MV, next state and info of a step with its ``plan`` (..., 1, m) and next outputs ``soon`` (..., 1, n_o)."""
