@@ -85,11 +85,18 @@ class Snapshot:
         if not operated or operated[-1][1] != operate:
             operated = (*operated[1 - MOST_OPERATED :], (seen_s, operate))
         stepped_s = seen_s if command.law_mv is not None or before is None else before.stepped_s
-        of = (seen_s, sample, command, loop.controller, stepped, successor, loop.replaced)
-        verdicts, numbers = tuple(monitor.verdicts()), monitor.numbers()
-        week = (weekly.week, dict(weekly.counts))
-        now = (loop.stepped, stepped_s, loop.courses.ends)
-        return cls(*of, *counts, operate, operated, *now, verdicts, numbers, *week)
+        return cls(
+            *(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts),
+            operate=operate,
+            operated=operated,
+            inputs=loop.stepped,
+            stepped_s=stepped_s,
+            courses=loop.courses.ends,
+            verdicts=tuple(monitor.verdicts()),
+            numbers=monitor.numbers(),
+            week=weekly.week,
+            counts=dict(weekly.counts),
+        )
 
 
 def about(station: Station) -> View:
