@@ -19,7 +19,10 @@ from loopwright.pipeline.laws.predictive.disturbance_model import (
     load_entry,
     slopes_of,
 )
+from loopwright.pipeline.laws.predictive.horizon import product
+from loopwright.pipeline.laws.predictive.observer import Observer
 from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.models.memory import Named
 
 MEAN_REST_STEPS = 10  # steps to the rest at the record's means
 LEAST_SHOWN = 1e-3  # scaled, a sample: of a load that moves the states by less a rest says nothing
@@ -147,3 +150,38 @@ def _left(model: Identified, loads: Loads, z: Tensor, v: Tensor) -> tuple[Tensor
     a, b = slopes_of(model, x, acting)
     eye = torch.eye(model.n_x, dtype=torch.float64)
     return ahead - x, torch.cat([(eye - a)[..., model.n_y :], -load_entry(b, loads)], dim=-1)
+
+
+def cold_start(now: Named, observer: Observer, largest: Tensor, bent: Tensor) -> Tensor:
+    """[x, d] (..., 1, n_a) of a law without a past: of the rests on offer the one that moves least by itself.
+
+    A rest under the loads that the slopes in the middle of the record give, one without loads, and of a network
+    the one of ``bent_rest``: a network that bends much has other slopes elsewhere, and where it hardly rests the
+    others serve. ``now`` has them as ``held``, ``free``, ``straight`` and ``bends``; ``bent`` (BENDS, n_a) is empty
+    where the last is not there. Loads are at most ``largest`` (n_d,), such that MVs can balance them.
+    """
+    offered = [_within(now["held"], observer.n_x, largest)]
+    if not observer.nonlinear:
+        return offered[0]
+    offered.append(now["free"])
+    if len(bent):
+        found = product(torch.tanh(now["bends"]), bent, now["straight"])
+        rest = torch.cat([now["y"], found[..., observer.n_y :]], dim=-1)
+        offered.append(_within(rest, observer.n_x, largest))
+    best, least = offered[0], _moves_by(observer, offered[0], now["v"])
+    for other in offered[1:]:
+        moves = _moves_by(observer, other, now["v"])
+        best, least = torch.where(moves < least, other, best), torch.minimum(moves, least)
+    return best
+
+
+def _within(start: Tensor, n_x: int, largest: Tensor) -> Tensor:
+    """[x, d] with loads that MVs can balance."""
+    loads = torch.minimum(torch.maximum(start[..., n_x:], -largest), largest)
+    return torch.cat([start[..., :n_x], loads], dim=-1)
+
+
+def _moves_by(observer: Observer, start: Tensor, v: Tensor) -> Tensor:
+    """Sum of squares (..., 1, 1) by which the states of [x, d] change in a sample under v."""
+    moved = (observer.ahead(start, v) - start)[..., : observer.n_x]
+    return (moved * moved).sum(-1, keepdim=True)

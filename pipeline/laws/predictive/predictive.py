@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
-from loopwright.pipeline.laws.predictive.cold_rest import BentRest, bent_rest, held_rest
+from loopwright.pipeline.laws.predictive.cold_rest import bent_rest, cold_start, held_rest
 from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, loads_of
-from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of, product
+from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
 from loopwright.pipeline.laws.predictive.horizon_check import AnswerTimes, horizon_for, mvs_of, refuse_unstable
 from loopwright.pipeline.laws.predictive.known_future import KnownFuture, ahead_of
 from loopwright.pipeline.laws.predictive.observer import Noises, Observer, StateEstimate, load_variance
@@ -237,7 +237,12 @@ class Predictive(ControlLaw):
         rest, free = held_rest(model, loads), torch.cat([model.rest, torch.zeros(loads.count, model.rest.shape[1])])
         for start in (rest, free):
             start[:n_y] = torch.eye(*start[:n_y].shape, dtype=torch.float64)  # rounding moves no output
-        bent = self._bent(model, loads, rest, middle, half)
+        bent = None
+        if self.observer.nonlinear:
+            scale, centre = model.v_scale[: len(middle)], model.v_center[: len(middle)]
+            reach = [(middle - half - centre) / scale, (middle + half - centre) / scale]
+            bent = bent_rest(model, loads, rest, torch.stack(reach, dim=1))
+        self.register_buffer("bent", torch.zeros(0, 0).double() if bent is None else bent.bent.T.contiguous())
         signals = self.signals
         self.layout = {n: len(getattr(signals, n)) for n in ("sp", "pv", "dv", "mv")}
         self.inputs = AffineMap(self.layout, inputs)
@@ -435,51 +440,6 @@ class Predictive(ControlLaw):
         followed = kept["level"] + self.follow * (measured - kept["level"])
         return torch.where(kept["started"] > 0, followed, measured)
 
-    def _bent(self, model: Identified, loads: Loads, rest: Tensor, middle: Tensor, half: Tensor) -> BentRest | None:
-        """The map of a network's rests; None of a linear model, or where the network hardly rests."""
-        self.register_buffer("bent", torch.zeros(0, 0, dtype=torch.float64))
-        if not self.observer.nonlinear:
-            return None
-        scale, centre = model.v_scale[: len(middle)], model.v_center[: len(middle)]
-        found = bent_rest(
-            model, loads, rest, torch.stack([(middle - half - centre) / scale, (middle + half - centre) / scale], dim=1)
-        )
-        if found is not None:
-            self.bent = found.bent.T.contiguous()
-        return found
-
-    def _first(self, now: Named) -> Tensor:
-        """[x, d] (..., 1, n_a) without a past: of the rests on offer the one that moves least by itself.
-
-        A rest under the loads that the slopes in the middle of the record give, one without loads, and of a network
-        the one of ``bent_rest``: a network that bends much has other slopes elsewhere, and where it hardly rests the
-        others serve.
-        """
-        offered = [self._within(now["held"])]
-        if not self.observer.nonlinear:
-            return offered[0]
-        offered.append(now["free"])
-        if len(self.bent):
-            found = product(torch.tanh(now["bends"]), self.bent, now["straight"])
-            n_y = now["y"].shape[-1]
-            offered.append(self._within(torch.cat([now["y"], found[..., n_y:]], dim=-1)))
-        best, least = offered[0], self._moves_by(offered[0], now["v"])
-        for other in offered[1:]:
-            moves = self._moves_by(other, now["v"])
-            best, least = torch.where(moves < least, other, best), torch.minimum(moves, least)
-        return best
-
-    def _within(self, start: Tensor) -> Tensor:
-        """[x, d] with loads that MVs can balance."""
-        n_x = self.observer.n_x
-        loads = torch.minimum(torch.maximum(start[..., n_x:], -self.largest), self.largest)
-        return torch.cat([start[..., :n_x], loads], dim=-1)
-
-    def _moves_by(self, start: Tensor, v: Tensor) -> Tensor:
-        """Sum of squares (..., 1, 1) by which the states of [x, d] change in a sample under v."""
-        moved = (self.observer.ahead(start, v) - start)[..., : self.observer.n_x]
-        return (moved * moved).sum(-1, keepdim=True)
-
     def _estimated(
         self, now: Named, kept: Named, fresh: Tensor | None = None, load_share: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -497,7 +457,7 @@ class Predictive(ControlLaw):
         )
         flat = seen.covariance.flatten(-2).index_select(-1, self.upper).unsqueeze(-2)
         known = torch.cat([seen.mean, flat, seen.drift, seen.squares, kept["plan"] @ self.shift], dim=-1)
-        first = torch.cat([self._first(now), now["past"]], dim=-1)
+        first = torch.cat([cold_start(now, self.observer, self.largest, self.bent), now["past"]], dim=-1)
         past = torch.where(kept["started"] > 0, known, first)
         n_plan = self.moves.count
         return past[..., :n_a], kept["started"] * boost, past[..., :-n_plan], past[..., -n_plan:]
