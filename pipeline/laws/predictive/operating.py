@@ -32,6 +32,9 @@ LEAST_WEIGHT, MOST_WEIGHT = 0.1, 10.0
 REST_WEIGHT = 0.01  # of a squared half range away from a resting value, a sample: a set point feels nothing of it
 COST_SLOPE = 0.03  # of the dearest signal, a sample and scaled unit: costs move a set point by .05 % of its range
 TINY_COST = 1e-12  # costs below it are none
+# Standard deviations of the estimated output over which the price of a range without a set point grows. Where a set
+# point pulls with all its weight, the output is then 1.8 of them beyond where the price begins: within its range.
+BLUR_SDS = 10.0
 MARGIN_SDS = 2.0  # standard deviations of the estimated output by which a range without a set point is kept inside
 
 
@@ -115,6 +118,7 @@ class Operation(nn.Module):
 
     slope: Tensor  # (1,)
     margin: Tensor  # (1,)
+    blur: Tensor  # (1,)
     others: Tensor  # the places of all entries but the weights
     weights: Tensor  # those of the weights
 
@@ -123,7 +127,7 @@ class Operation(nn.Module):
     ) -> None:
         super().__init__()
         self.horizon, self.n_moves, self.scales = moves.horizon, len(moves.starts), scales
-        hold_numbers(self, slope=COST_SLOPE, margin=MARGIN_SDS)
+        hold_numbers(self, slope=COST_SLOPE, margin=MARGIN_SDS, blur=BLUR_SDS)
         # Apart from the others, whose sums are then the same to the bit as in a law without weights.
         self.register_buffer("weights", torch.tensor([i for i, e in enumerate(entries) if e.what == "weight"]))
         self.register_buffer("others", torch.tensor([i for i, e in enumerate(entries) if e.what != "weight"]))
@@ -183,13 +187,15 @@ class Operation(nn.Module):
         by = self.slope / torch.clamp(largest, min=TINY_COST)
         # A range stays dearer than every set point.
         heaviest = torch.clamp(weights.amax(dim=-1, keepdim=True), min=1.0)
-        margin = self._samples(torch.minimum(self.margin * sd * p["free"], p["width"]))
+        unsure = sd * p["free"]
+        margin = self._samples(torch.minimum(self.margin * unsure, p["width"]))
         return OperatedPlan(
             track=p["track"] * p["use"] * self._samples(weights),
             low=p["low"],
             high=p["high"],
             low_inside=p["low"] + margin,
             high_inside=p["high"] - margin,
+            blurred=self._samples(self.blur * unsure),
             price=torch.exp(p["rank"]) * p["use"] * heaviest,
             y_cost=by * p["y_cost"] * p["use"],
             stands=stands,

@@ -86,6 +86,7 @@ class OperatedPlan(NamedTuple):
     low_inside: Tensor  # where the price of leaving it begins
     high_inside: Tensor
     price: Tensor  # of what lies beyond a range; 0 out of use
+    blurred: Tensor  # by what the price grows more slowly, where noise would throw an output in and out of its range
     y_cost: Tensor  # slope of the cost over the outputs
     stands: Tensor  # where the MV goes on from, at every move
     off: Tensor  # by how much the actuator stands off its command, at every move: it stays so
@@ -201,7 +202,7 @@ class Planner(nn.Module):
     damping: Tensor  # (1,) kappa
     apart: Tensor  # (m, m) ones, and 0 on the diagonal
     soft: Tensor  # (1,) of the price of a range
-    soft_squared: Tensor  # (1,)
+    blunt: Tensor  # (1,) of the price of a range
     near: Tensor  # (1,) to a bound
 
     def __init__(
@@ -236,7 +237,7 @@ class Planner(nn.Module):
         for name, values in buffers.items():
             self.register_buffer(name, values)
         hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2, damping=cost.damping)
-        hold_numbers(self, soft=SOFT, soft_squared=EPS**2, near=AT_BOUND)
+        hold_numbers(self, soft=SOFT, blunt=EPS, near=AT_BOUND)
 
     def forward(
         self,
@@ -294,7 +295,7 @@ class Planner(nn.Module):
 
         t is the weight of a set point over the designed one, 0 where none is followed, b_o what lies beyond the range
         of output o, p_o the cost of
-        ``SoftLimits`` with its price by rank, s the stiffness. A set point outside its range counts as the end of it.
+        ``SoftLimits`` with its price by rank, s the stiffness; delta and eps of it are larger by ``blurred``. A set point outside its range counts as the end of it.
         """
         stiff = by.stiffness * self.moved + by.rest_weight * self.eye
         at = applied @ self.first
@@ -306,11 +307,12 @@ class Planner(nn.Module):
             for end in (by.z_low, by.z_high)
         )
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        soft, blunt = self.soft + by.blurred, self.blunt + by.blurred
         for _ in range(self.passes):
             run = self.horizon(start, plan + by.off, forecast)
             error = run.y - wanted
             weight = weights / torch.sqrt(error * error + self.eps_squared)
-            push = limit_cost(run.y, by.low_inside, by.high_inside, by.price, self.soft, self.soft_squared)
+            push = limit_cost(run.y, by.low_inside, by.high_inside, by.price, soft, blunt * blunt)
             both = weight + push.weight
             back = both * (plan @ run.slopes) - weight * error - push.slope - by.y_cost
             pull = product(back, run.slopes_t, held)
