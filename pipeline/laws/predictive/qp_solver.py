@@ -295,7 +295,8 @@ class Planner(nn.Module):
 
         t is the weight of a set point over the designed one, 0 where none is followed, b_o what lies beyond the range
         of output o, p_o the cost of
-        ``SoftLimits`` with its price by rank, s the stiffness; delta and eps of it are larger by ``blurred``. A set point outside its range counts as the end of it.
+        ``SoftLimits`` with its price by rank, s the stiffness; its delta and eps are larger by ``blurred``. A set point
+        outside its range counts as the end of it.
         """
         stiff = by.stiffness * self.moved + by.rest_weight * self.eye
         at = applied @ self.first
