@@ -64,6 +64,7 @@ class History:
             critical=[m.pv[0].name] if rng.random() < 0.2 else [],
         )  # fmt: skip
         self.plant.mode = lambda: self.loop.mode
+        self.plant.written = known
 
     def run(self, scans: int = SCANS) -> Findings:
         """All scans; an exception ends the history."""

@@ -305,7 +305,7 @@ class ControlLoop:
         self._applied.arrived()
         shown = self._applied.look(sample, self._mv, refused=bool(reason), theirs=self._out.local.away)
         self.found = shown.found
-        if self._took_over and shown.applied is not None:
+        if shown.applied is not None and (self._took_over or (self._hand.wanted is not None and isnan(self._mv[0]))):
             self._mv = shown.applied.copy()
         if shown.silent:
             if shown.outside:

@@ -67,7 +67,7 @@ LEAST_DAY, MOST_DAY = 2_000, 200_000  # scans over which a share is taken
 SWING_BAND = 0.005  # of a set point's range: smaller errors are no swing
 HARRIS_SCANS = 500  # scans that Harris's index is taken from
 NEAR_REST = 0.02  # of a set point's range: a mean error beyond is no rest
-LEAST_READINGS = 3  # of each variable in a period of rest: a slow analyser makes it longer
+REST_READINGS = 3  # of each variable in a period of rest: a slow analyser makes it longer
 
 
 class Monitor:
@@ -278,7 +278,7 @@ class Monitor:
                 window.append(value)
             else:
                 window.clear()  # its index is of readings at each scan
-        if self._n < self.settle or (self._readings_of < LEAST_READINGS).any():
+        if self._n < self.settle or (self._readings_of < REST_READINGS).any():
             return
         mean = self._e_sum / self._readings_of
         if not self._ends and (np.abs(mean) <= NEAR_REST * self._sp_span).all():

@@ -1,4 +1,4 @@
-"""What a scan is a measure of: which signals the law has in use, which readings are new, and the error of each CV."""
+"""Use of the signals at a scan: which ones the law has in use, which readings are new, and the error of each CV."""
 
 from __future__ import annotations
 

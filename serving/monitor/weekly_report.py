@@ -17,7 +17,7 @@ Row: TypeAlias = tuple[str, ...]
 
 COLUMNS = ("signal", "by the law", "out of use", "bad reading", "at low limit", "at high limit", "error or travel")
 WORTH_SAYING = 0.01  # share of the time on control from which on a limit or a use is said: less is nobody's business
-HOUR_S = 3600.0
+HOUR_SECONDS = 3600.0  # [s] of an hour: travel is told by the hour
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ def shares(counts: Mapping[str, float]) -> dict[str, float]:
     if not auto:
         return found
     found["all_in_use_share"] = counts.get("all in use", 0.0) / auto
-    hours = auto * counts.get("period_s", 0.0) / HOUR_S
+    hours = auto * counts.get("period_s", 0.0) / HOUR_SECONDS
     for _, name, of in signals_in(counts):
         for what, count in of.items():
             if what == "readings":
@@ -82,14 +82,14 @@ def week_report(week: str, counts: Mapping[str, float], units: Mapping[str, str]
     recorded, auto = _recorded(counts), counts.get(Mode.AUTO, 0.0)
     if not recorded:
         return WeekReport(week, f"week of {week}: no scan", (), ())
-    hours = recorded * counts.get("period_s", 0.0) / HOUR_S
+    hours = recorded * counts.get("period_s", 0.0) / HOUR_SECONDS
     modes = [f"{mode} {_percent(counts[mode] / recorded)}" for mode in Mode if counts.get(mode)]
     headline = f"week of {week}: {hours:.1f} h recorded; {', '.join(modes)}"
     if not auto:
         return WeekReport(week, headline, (), ("the law was not in control",))
     headline += f"; with every signal in use {_percent(counts.get('all in use', 0.0) / auto)} of the time in AUTO"
     known = list(signals_in(counts))
-    auto_h = auto * counts.get("period_s", 0.0) / HOUR_S
+    auto_h = auto * counts.get("period_s", 0.0) / HOUR_SECONDS
     rows = tuple(_row(group, name, of, auto, auto_h, units.get(name, "")) for group, name, of in known)
     notes = [note for group, name, of in known for note in _notes(group, name, of, auto, units.get(name, ""))]
     held = counts.get(Mode.HOLD, 0.0) / recorded

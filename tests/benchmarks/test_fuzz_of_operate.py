@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,10 +23,12 @@ def fuzz() -> SimpleNamespace:
 
 
 @pytest.fixture(scope="module")
-def laws(fuzz: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Callable[[int], Sequence[Any]]:
-    logging.getLogger("loopwright.serving.loop").setLevel(logging.CRITICAL)
-    opened: Callable[[int], Sequence[Any]] = fuzz.operate_fuzz.opened(tmp_path_factory.mktemp("laws"))
-    return opened
+def laws(fuzz: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[int], Sequence[Any]]]:
+    log = logging.getLogger("loopwright.serving.loop")
+    before = log.level
+    log.setLevel(logging.CRITICAL)
+    yield fuzz.operate_fuzz.opened(tmp_path_factory.mktemp("laws"))
+    log.setLevel(before)
 
 
 def histories(fuzz: SimpleNamespace, laws: Callable[[int], Sequence[Any]]) -> list[Any]:

@@ -229,6 +229,16 @@ def limited(controller: Controller, max_move: float | None) -> Controller:
     return changed
 
 
+def test_the_way_by_hand_begins_at_the_read_back_of_a_sample_that_is_refused(shared: Controller) -> None:
+    """Nobody said where the valve stands, and the first sample has a bad sensor, but a sound read-back."""
+    loop = slow_loop(shared, mv=None, mode=Mode.MANUAL)
+    loop.set_mv([90.0])
+    refused = Sample(pv=np.array([np.nan, 300.0]), mv_applied=np.array([40.0]), dv=np.zeros(1))
+    command = loop.scan(refused)
+    assert command.fault
+    assert command.mv.tolist() == [45.0]
+
+
 def test_a_move_beyond_the_mvs_rate_is_a_fault_and_never_written(shared: Controller) -> None:
     loop = slow_loop(shared, guards=())
     assert loop.scan(sample(-2.8)).mv[0] == pytest.approx(44.94)
