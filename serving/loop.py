@@ -305,7 +305,8 @@ class ControlLoop:
         self._applied.arrived()
         shown = self._applied.look(sample, self._mv, refused=bool(reason), theirs=self._out.local.away)
         self.found = shown.found
-        if shown.applied is not None and (self._took_over or (self._hand.wanted is not None and isnan(self._mv[0]))):
+        blind = self._out.hand.wanted is not None and isnan(self._mv[0])  # on a way by hand from nobody knows where
+        if shown.applied is not None and (self._took_over or blind):
             self._mv = shown.applied.copy()
         if shown.silent:
             if shown.outside:
@@ -371,8 +372,9 @@ class ControlLoop:
 
         Where the scan has found that the MV stands elsewhere, it stays there.
         """
-        if self.mode is not Mode.MANUAL or self._out.hand.wanted is not None:
-            self._mv = np.array(before if self.found is None else self.found, dtype=np.float64)
+        stands = np.array(before if self.found is None else self.found, dtype=np.float64)
+        by_hand = self.mode is Mode.MANUAL and self._out.hand.wanted is None  # where it should be is where it goes
+        self._mv = self._out.hand.sent(stands, self._mv, self.controller.manifest.mv) if by_hand else stands
         self._applied.lose()
         self._lose(reason)
         self._scan -= 1
