@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from loopwright.serving.errors import EndpointError, LoopError
 from loopwright.serving.guard import Fault, Sample
 from loopwright.serving.manifest import Manifest
+from loopwright.serving.opcua.analysers import Analysers
 from loopwright.serving.opcua.link import Link
 from loopwright.serving.opcua.mv_sender import HAND_BACK, Heartbeat, MvSender
 from loopwright.serving.opcua.nameplates import Identity, Nameplates, identity, whole
@@ -105,6 +106,7 @@ class OpcUaEndpoint:
         names, rewrite_s = [s.name for s in manifest.mv], server.rewrite_s / speed
         self.sender = MvSender(names, rewrite_s, self.answer_s, NodeLease(self.period_s), clock)
         self.nameplates, self._identified = Nameplates(nodes, manifest, spaces), identified
+        self._analysers = Analysers(manifest, nodes.analysers, speed)
         self._heartbeat, self._sampling = Heartbeat(), NodeSampling(manifest, server, nodes, self.nameplates)
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -157,7 +159,8 @@ class OpcUaEndpoint:
             values.pv, mv, values.dv, age * self.speed, values.fault, values.quality, ", ".join(late), values.bad_pv
         )
         sample = replace(sample, local=values.local) if values.local else sample
-        return self._late_apart(sample, values, late, now) if late and self._sampling.apart else sample
+        sample = self._late_apart(sample, values, late, now) if late and self._sampling.apart else sample
+        return self._analysers.look(sample, values.arrived_s) if self._sampling.apart else sample
 
     def _late(self, values: Values, now: float) -> list[str]:
         """The signals that are too old, where others are not."""

@@ -51,6 +51,7 @@ class Row:
     judged: bool = False
     written: bool = False
     entry: OperateEntry | None = None
+    stands: bool = False  # whether its number stands between two results of an analyser
 
     @property
     def title(self) -> str:
@@ -80,8 +81,11 @@ class Row:
 
     @property
     def ages(self) -> bool:
-        """Whether its value grows stale: a measurement does, and a value that somebody set is as old as it is."""
-        return self.judged and self.role is not Role.MV
+        """Whether its value grows stale: a measurement does, and a value that somebody set is as old as it is.
+
+        So is the last result of an analyser.
+        """
+        return self.judged and self.role is not Role.MV and not self.stands
 
 
 class NodePlan:
@@ -94,7 +98,7 @@ class NodePlan:
         used, wanted = "dv" in manifest.inputs, {s.name: s for s in manifest.sp}
         entries = {e.name: e for e in manifest.operate}
         self.rows = [
-            *(Row(Role.PV, pv[s.name], s, judged=True) for s in manifest.pv),
+            *(Row(Role.PV, pv[s.name], s, judged=True, stands=s.name in nodes.analysers) for s in manifest.pv),
             *(Row(Role.MV, mv[s.name], s, judged=True) for s in manifest.mv),
             *(Row(Role.DV, dv[s.name], s, judged=used) for s in self.dvs),
             *(Row(Role.SP, point, wanted[name]) for name, point in sp.items()),

@@ -155,7 +155,7 @@ class NodeSampling:
             )
             # What nobody judges, a set point or a mode of the plant's side, is none where its quality is not good; nor
             # is a read-back, which says where the MV stands also while a PV is bad.
-            told = usable or row.ages
+            told = usable or row.ages or row.stands
             found[name] = point.scale * answer.number + point.offset if told else np.nan
             if usable and not answer.text and (row.judged or row.request):
                 changed = self.nameplates.typed(row, answer.kind)

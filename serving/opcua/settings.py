@@ -101,7 +101,8 @@ class Nodes:
     counts as dead after ``watchdog_scans`` scans without a change. ``lease`` is a text that holds who controls this
     plant. Without it a node LoopwrightLease is the lease that lies beside those of the MVs; "none": there is no lease.
     ``operate`` has nodes by which the plant's own operator changes values of the law's ``operate``, each by its name,
-    ``local`` those that say whether the plant has an MV itself.
+    ``local`` those that say whether the plant has an MV itself. ``analysers`` are process variables whose number stands
+    between two results: each with the longest time [s] without a new one.
     """
 
     pv: Mapping[str, str | Point]
@@ -110,6 +111,7 @@ class Nodes:
     sp: Mapping[str, str | Point] = field(default_factory=dict)
     operate: Mapping[str, str | Point] = field(default_factory=dict)
     local: Mapping[str, LocalNode] = field(default_factory=dict)
+    analysers: Mapping[str, float] = field(default_factory=dict)
     mode: ModeNode | None = None
     heartbeat: str = ""
     watchdog: str = ""
@@ -149,6 +151,16 @@ class Nodes:
                 raise LoopError(f"nodes.{name} lacks {', '.join(missing)}; give each a node id")
             if name != "mv" and any(p.read_back for p in points.values()):
                 raise LoopError(f"nodes.{name} has a read_back, which only an MV has")
+        pvs = [s.name for s in manifest.pv]
+        for given, wait in self.analysers.items():
+            if given not in pvs:
+                raise LoopError(f"nodes.analysers has {given!r}, which is no PV{nearest(given, pvs)}")
+            if not (isfinite(wait) and wait > 0):
+                raise LoopError(f"nodes.analysers: {given} is {wait:g}; it needs the longest time in seconds, above 0")
+        if self.analysers and "fresh" not in manifest.inputs:
+            raise LoopError(
+                f"nodes.analysers: {manifest.law} takes each number for a new reading; design it with `operate: {{}}`"
+            )
         able = [e.signal for e in manifest.operate if e.group == "mv" and e.what == "use"]
         for given in self.local:
             if given not in able:

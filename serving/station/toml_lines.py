@@ -50,6 +50,9 @@ def fresh_lines(m: Manifest) -> list[str]:
         "[fresh]  # a PV whose reading alone is bad",
         f"bridge_s = {BRIDGE_PERIODS * m.period_s:g}  # [s] for which the law predicts it; then it is left out",
         f"# critical = [{text_of(m.pv[0].name)}]  # without these the loop holds then",
+        "",
+        "# [nodes.analysers]  # PVs whose number stands between two results: the longest time [s] without a new one",
+        f"# {key_of(m.pv[-1].name)} = {100 * m.period_s:g}",
     ]
 
 

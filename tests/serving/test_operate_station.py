@@ -361,3 +361,32 @@ def test_the_command_passes_names_and_values_on(operated: Controller, tmp_path: 
         assert main([*words[:2], "valve.high", *words[4:]]) == 2
     finally:
         made.close()
+
+
+# ----------------------------------------------------------------------------------------------------------- analysers
+def test_an_analyser_is_new_where_its_number_changes_and_bad_after_it_has_stood_too_long(operated: Controller) -> None:
+    nodes = Nodes(**NODES, analysers={"x": 100.0})
+    nodes.check(operated.manifest)
+    rows = NodePlan(nodes, operated.manifest).rows[:3]
+    assert [row.title for row in rows if not row.ages] == ["PV x"]
+    times = [0.0]
+    made = OpcUaEndpoint(operated.manifest, SERVER, nodes, max_age_s=1.5, clock=lambda: times[-1])
+    made.trouble = ""
+    found = []
+    for at, number in ((0.0, 0.5), (1.0, 0.5), (2.0, 0.6), (3.0, 0.6), (102.0, 0.6), (103.0, 0.6), (104.0, 0.7)):
+        times.append(at)
+        pv = np.array([300.0, 5.0, number])
+        ages = {"PV T": 0.0, "PV p": 0.0}
+        made.values = Values(at, pv, np.array([40.0, 0.5]), np.zeros(0), 0.0, "", (0,) * 5, ages=ages)
+        sample = made.read()
+        assert sample.fresh is not None
+        found.append((sample.fresh.tolist(), bool(sample.bad_pv and sample.bad_pv[2])))
+    assert [fresh[2] for fresh, _ in found] == [1, 0, 1, 0, 0, 0, 1]
+    assert all(fresh[:2] == [1, 1] for fresh, _ in found)
+    assert [bad for _, bad in found] == [False, False, False, False, False, True, False]
+
+
+def test_an_analyser_that_cannot_be_is_refused(operated: Controller, not_operated: Controller) -> None:
+    for analysers, of in (({"y": 9.0}, operated), ({"x": 0.0}, operated), ({"x": 9.0}, not_operated)):
+        with pytest.raises(LoopError, match=r"nodes\.analysers"):
+            Nodes(**NODES, analysers=analysers).check(of.manifest)
