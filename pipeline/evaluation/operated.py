@@ -16,7 +16,10 @@ MOST_MOVED_OUT: Final = 1e-6  # of an MV's range while it is out of use: the sol
 
 @dataclass(frozen=True, slots=True)
 class OperatedLimits:
-    """Limits of one test, each a share: time outside ranges that a steady state allows, at most; gain, at least."""
+    """Limits of one test, each a share.
+
+    ``most_outside``: of the time outside ranges that a steady state allows; ``least_gain``: of what was to be gained.
+    """
 
     most_outside: float = MOST_OUTSIDE
     least_gain: float = LEAST_GAIN
@@ -24,7 +27,7 @@ class OperatedLimits:
 
 @dataclass(frozen=True, slots=True)
 class RangeResult:
-    """A PV and the range that it had at the end of a test.
+    """A PV, the ``signal`` with its ``unit``, and the range ``low`` to ``high`` of this ``rank`` at the end of a test.
 
     ``outside``: share of the samples since the first change at which it was outside the range of that sample by more
     than ``hidden`` [unit]; ``late``: the same over the end of the test, see ``OperatedLoop.late_s``. ``mean`` and
@@ -52,8 +55,9 @@ class RangeResult:
 
 @dataclass(frozen=True, slots=True)
 class MvResult:
-    """An MV over a test: its travel [unit] with its first move, and the share of time at an operator's limit.
+    """An MV, the ``signal`` with its ``unit``, over a test.
 
+    ``travel`` [unit] counts its first move, ``clamped`` is the share of time at an operator's limit.
     ``travel_share`` is the travel in widths of its range; ``moved_out``: its largest move while it was out of use, in
     shares of its range; ``rest``: where it should be in the end, and ``miss`` how far it is from there [unit],
     ``miss_share`` in shares of its range. None where not asked.
@@ -72,9 +76,10 @@ class MvResult:
 
 @dataclass(frozen=True, slots=True)
 class ErrorResult:
-    """A PV with a set point: mean distance at the end from where the best steady state has it, and as a share.
+    """A PV with a set point, the ``signal`` with its ``unit``, at the end of a test.
 
-    ``share`` is of what set points move it by.
+    ``error``: mean distance [unit] from where the best steady state has it; ``share``: the same as a share
+    of what set points move it by.
     """
 
     signal: str
@@ -85,8 +90,9 @@ class ErrorResult:
 
 @dataclass(frozen=True, slots=True)
 class OperatedLoop:
-    """One closed loop of such a test, with noise on its readings; figures are of the true values.
+    """One closed loop of such a test over ``duration_s`` [s], with noise on its readings; figures are of true values.
 
+    ``ranges``, ``mvs`` and ``errors`` are those of its signals, ``refused`` counts steps that the law did not make.
     Profits are per hour, in the costs' currency: ``profit`` over the end of the test, from ``late_s`` [s] on, the last
     third since anything changed; ``before`` at the start, ``optimum`` of the best steady state of the plant itself, and
     ``gain`` the share of what was to be gained. ``borne``: share of the violation that the last rank bears, where
@@ -108,7 +114,7 @@ class OperatedLoop:
 
 @dataclass(frozen=True, slots=True)
 class OperatedResult:
-    """One test by its loops, each on a plant of its own, and the limits by which it is judged.
+    """One test of this ``title`` by its ``loops``, each on a plant of its own, and the ``limits`` that judge it.
 
     The worst loop counts, of profits their mean.
     """

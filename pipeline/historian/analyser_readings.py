@@ -18,7 +18,7 @@ from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record
 
-POLES = (0.3, 0.5, 0.65, 0.75, 0.82, 0.87, 0.91, 0.94, 0.96, 0.975, 0.985)
+LAG_POLES = (0.3, 0.5, 0.65, 0.75, 0.82, 0.87, 0.91, 0.94, 0.96, 0.975, 0.985)
 """Poles of the lags by which an analyser's readings are explained by the inputs, a few of them."""
 
 MOST_POLES = 3
@@ -31,7 +31,7 @@ LATE_NATS = 2.0
 """Nats within which a lateness explains the readings as well: the least of these is taken, since the model's own lags
 can stand for a lateness that is too short, and nothing for one that is too long."""
 
-ROWS_A_LAG = 4
+READINGS_A_LAG = 4
 """New readings for each coefficient of the lags."""
 
 RIDGE = 1e-6
@@ -97,7 +97,7 @@ def _bounds(run: NDArray[np.int64]) -> list[tuple[int, int]]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Explained:
+class LagsExplained:
     """The lateness [rows] of an output, and what the inputs explain of it (n,) at the rows of the samples."""
 
     late: int
@@ -140,16 +140,16 @@ class _Bank:
 
         v = np.hstack([record.mv, record.dv])
         v = (v - v.mean(axis=0)) / np.maximum(v.std(axis=0), 1e-300)
-        found = np.empty((len(POLES), *v.shape))
+        found = np.empty((len(LAG_POLES), *v.shape))
         for first, end in runs:
             part = v[first:end]
-            for i, pole in enumerate(POLES):
+            for i, pole in enumerate(LAG_POLES):
                 filtered, _ = lfilter([1 - pole], [1.0, -pole], part, axis=0, zi=pole * part[:1])
                 found[i, first] = part[0]
                 found[i, first + 1 : end] = filtered[:-1]
         return cls(np.concatenate(list(found), axis=1), runs, v.shape[1])
 
-    def explain(self, y: Array, fresh: NDArray[np.bool_]) -> Explained:
+    def explain(self, y: Array, fresh: NDArray[np.bool_]) -> LagsExplained:
         """The lateness that explains the readings ``y`` (n,) at ``fresh`` rows, and what is expected of every row.
 
             y(k) = c + sum_jp b_jp f_jp(k - late),   f_jp(k + 1) = p f_jp(k) + (1 - p) v_j(k)
@@ -160,16 +160,16 @@ class _Bank:
         for first, end in self.runs:
             inside[first + MOST_LATE : end] = True
         rows = np.flatnonzero(fresh & inside)
-        choices = [of for of in _choices() if len(rows) >= ROWS_A_LAG * (len(of) * self.n_v + 1)]
+        choices = [of for of in _choices() if len(rows) >= READINGS_A_LAG * (len(of) * self.n_v + 1)]
         if not choices:
-            return Explained(0, np.interp(np.arange(len(y)), np.flatnonzero(fresh), y[fresh]))
+            return LagsExplained(0, np.interp(np.arange(len(y)), np.flatnonzero(fresh), y[fresh]))
         most = self.chosen(max(choices, key=len))[rows]
         memory = _memory(y[rows] - _of(_fit(most, y[rows], 0.0), most))
         costs = np.array([self._costs(rows, late, y[rows], memory, choices) for late in range(MOST_LATE + 1)])
         least = costs.min(axis=1)
         late = int((least <= least.min() + LATE_NATS).argmax())
         columns = self.chosen(choices[int(costs[late].argmin())])
-        return Explained(late, _of(_fit(columns[rows - late], y[rows], memory), columns))
+        return LagsExplained(late, _of(_fit(columns[rows - late], y[rows], memory), columns))
 
     def chosen(self, poles: Sequence[int]) -> Array:
         """The columns (n, poles n_v) of some poles."""
@@ -193,8 +193,8 @@ class _Bank:
 
 
 def _choices() -> list[tuple[int, ...]]:
-    """Places of some of the POLES, at most ``MOST_POLES`` together."""
-    return [of for n in range(1, MOST_POLES + 1) for of in combinations(range(len(POLES)), n)]
+    """Places of some of the LAG_POLES, at most ``MOST_POLES`` together."""
+    return [of for n in range(1, MOST_POLES + 1) for of in combinations(range(len(LAG_POLES)), n)]
 
 
 def _of(fitted: tuple[float, Array], columns: Array) -> Array:

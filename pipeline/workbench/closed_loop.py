@@ -68,7 +68,7 @@ def design(
 def export(law: ControlLaw, path: str | Path, *, case: str = NOTEBOOK) -> Controller:
     """The law as one ONNX file, checked step by step against the law, and loaded by the runtime that will run it.
 
-    Of a predictive law with ``operate`` the graph that explains it is written beside it. Raises ExportError where the
+    A predictive law with ``operate`` has the graph that explains it beside it. Raises ExportError where the
     graph differs from the law; nothing is written then.
     """
     write_controller(law, path, case=case, provenance={})

@@ -32,7 +32,7 @@ def controller_path(explain: str | Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class ExplainManifest:
-    """What an explain graph says of itself.
+    """An explain graph, as it says of itself.
 
     It belongs to the file with the SHA-256 ``controller``, has these ``inputs`` of that one, and predicts the first
     ``outputs`` process variables over ``horizon`` samples. The MVs' moves start at the samples ``starts``. ``parts``

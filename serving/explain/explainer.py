@@ -14,7 +14,7 @@ from loopwright.serving.controller import Controller, session_of
 from loopwright.serving.controller_file import read_controller
 from loopwright.serving.errors import ArtifactError, ContractError, OutputError
 from loopwright.serving.explain.explain_file import controller_path, explain_manifest
-from loopwright.serving.explain.explanation import Cause, Course, ExplainedMove, Explanation, MovePart, WhatIf
+from loopwright.serving.explain.explanation import Cause, SignalCourse, ExplainedMove, Explanation, MovePart, WhatIf
 from loopwright.serving.explain.sentence import sentence_of
 from loopwright.serving.fields import nearest, shown
 from loopwright.serving.graph.audit import audit
@@ -22,9 +22,9 @@ from loopwright.serving.operating import Operate
 from loopwright.serving.ranges import numbers, within
 
 Array: TypeAlias = NDArray[np.float64]
-ROUNDING = 1e-13  # of an MV's range: a smaller part is none
-# Of an MV's range: by so much both graphs may differ and be one law. They round apart, and where the plan hardly bends
-# rounding grows: on a served tank with three valves for two variables by more than 1e-9.
+NO_PART = 1e-13  # of an MV's range: a smaller part is none
+# Share of an MV's range by which both graphs may differ and be one law. They round apart, and where the plan hardly
+# bends rounding grows: on a served tank with three valves for two variables by more than 1e-9.
 SAME_MV = 1e-6
 
 
@@ -100,7 +100,7 @@ class Explainer:
         fresh: ArrayLike | None = None,
         ahead: ArrayLike | None = None,
     ) -> WhatIf:
-        """What the law would do after ``changes``, beside what it does without them; nothing is set.
+        """The courses that the law would make after ``changes``, beside what it does without them; nothing is set.
 
         ``changes`` name set points by their signals, and entries of ``operate`` as these are named. The courses are
         those of the closed loop over the law's own model: the law plans anew at every sample, disturbances stay.
@@ -169,11 +169,14 @@ class Explainer:
         z = found["z"].reshape(len(explains.starts), len(self.manifest.mv))
         return Explanation(period_s, self._courses(ahead, y, starts, z), self._moves(found, given))
 
-    def _courses(self, ahead: tuple[float, ...], y: Array, starts: tuple[float, ...], z: Array) -> tuple[Course, ...]:
+    def _courses(
+        self, ahead: tuple[float, ...], y: Array, starts: tuple[float, ...], z: Array
+    ) -> tuple[SignalCourse, ...]:
         pvs = self.manifest.pv[: self.explains.outputs]
-        cvs = [Course(s.name, "cv", s.unit, ahead, tuple(v.tolist())) for s, v in zip(pvs, y.T, strict=True)]
+        cvs = [SignalCourse(s.name, "cv", s.unit, ahead, tuple(v.tolist())) for s, v in zip(pvs, y.T, strict=True)]
         mvs = [
-            Course(s.name, "mv", s.unit, starts, tuple(v.tolist())) for s, v in zip(self.manifest.mv, z.T, strict=True)
+            SignalCourse(s.name, "mv", s.unit, starts, tuple(v.tolist()))
+            for s, v in zip(self.manifest.mv, z.T, strict=True)
         ]
         return (*cvs, *mvs)
 
@@ -189,7 +192,7 @@ class Explainer:
         for s, move, row in zip(m.mv, found["move"].tolist(), rows.tolist(), strict=True):
             span = s.high - s.low
             parts = [MovePart(cast("Cause", c), n, v) for (c, n), v in zip(causes, row, strict=True)]
-            parts = sorted((p for p in parts if abs(p.value) > ROUNDING * span), key=lambda p: -abs(p.value))
+            parts = sorted((p for p in parts if abs(p.value) > NO_PART * span), key=lambda p: -abs(p.value))
             parts = parts or [MovePart("not_in_use", s.name, move) if s.name in idle else MovePart("plan", "", move)]
             words = sentence_of(move, span, parts, news)
             moves.append(ExplainedMove(s.name, s.unit, move, tuple(parts), words))

@@ -17,7 +17,7 @@ BALANCED_MOVE = 1e-3  # of its largest part: a smaller move is what two parts le
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class SignalCourse:
     """A course of one signal: a CV as it is predicted, or an MV as it is planned.
 
     ``times_s`` [s] count from now. An MV goes to each value at its time, and stays there until the next one.
@@ -70,13 +70,13 @@ class ExplainedMove:
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """What a law predicts, plans and does next. Parts of its plan, not causes in the plant."""
+    """All that a law predicts, plans and does next. Parts of its plan, not causes in the plant."""
 
     period_s: float
-    courses: tuple[Course, ...]
+    courses: tuple[SignalCourse, ...]
     moves: tuple[ExplainedMove, ...]
 
-    def course(self, signal: str) -> Course:
+    def course(self, signal: str) -> SignalCourse:
         """The course of a signal; KeyError where it has none."""
         return {c.signal: c for c in self.courses}[signal]
 
@@ -109,7 +109,7 @@ class Explanation:
 
 @dataclass(frozen=True, slots=True)
 class WhatIf:
-    """What a law would do after ``changes`` by name, beside what it does without them.
+    """The courses after ``changes`` by name, beside what it does without them.
 
     The courses of both have a value at every sample: the law is stepped over its own model, which gives the readings.
     """

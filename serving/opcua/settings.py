@@ -61,7 +61,8 @@ class ModeNode:
 class LocalNode:
     """A node that says whether the plant has an MV itself, by numbers or texts.
 
-    The plant has it at one of the values ``local``, or at any value that is none of ``remote``: one of both is given.
+    ``node`` is its id. The plant has the MV at one of the values ``local``, or at any value that is none of ``remote``:
+    one of both is given.
     """
 
     node: str

@@ -13,7 +13,7 @@ from loopwright.serving.ranges import numbers
 
 Array: TypeAlias = NDArray[np.float64]
 
-ROUNDING = 1e-9  # share of a range by which a sum of a present value and a difference may be rounded
+SUM_ROUNDING = 1e-9  # share of a range by which a sum of a present value and a difference may be rounded
 
 
 class Differences:
@@ -23,7 +23,7 @@ class Differences:
         self.ahead = ahead
         self.none: Array = np.zeros(ahead.size)  # all stay as they are
         self._low, self._high = (np.array([getattr(s, end) for s in ahead.signals]) for end in ("low", "high"))
-        self._slack = ROUNDING * (self._high - self._low)
+        self._slack = SUM_ROUNDING * (self._high - self._low)
 
     def checked(self, values: ArrayLike, present: Array) -> Array:
         """``values`` as float64 (N n,); ContractError with the first signal and sample that is wrong.

@@ -19,10 +19,10 @@ from loopwright.pipeline.historian.cleaning.tags import Tag
 from loopwright.pipeline.historian.files.export import Series
 from loopwright.pipeline.metrics import Array
 
-LEAST_READINGS = 30  # of an analyser: a model of its own needs some for each number
-OFTEN = 0.5  # share of the rows from which new readings are no seldom ones: then the tag is a pv like others
+LEAST_NEW = 30  # of an analyser: a model of its own needs some for each number
+NOT_SELDOM = 0.5  # share of the rows from which new readings are no seldom ones: then the tag is a pv like others
 STORED = 0.5  # share of the cells that hold a value from which an archive repeats the last one
-MISSED = 1.5  # steps of the clock between two values: more is a time without any
+STEPS_WITHOUT = 1.5  # steps of the clock between two values: more is a time without any
 
 
 def new_readings(series: Series, step_s: float) -> Series:
@@ -38,7 +38,7 @@ def new_readings(series: Series, step_s: float) -> Series:
     step = np.diff(series.time_s[at])
     new = np.r_[True, np.diff(series.value[at]) != 0]
     if len(at) * step_s < STORED * (series.time_s[at[-1]] - series.time_s[at[0]] + step_s):
-        new[1:] |= (np.diff(at) > 1) | (step > MISSED * step_s)
+        new[1:] |= (np.diff(at) > 1) | (step > STEPS_WITHOUT * step_s)
     kept = ~good
     kept[at[new]] = True
     return replace(series, time_s=series.time_s[kept], value=series.value[kept], code=series.code[kept])
@@ -70,18 +70,18 @@ def rows_between(fresh: NDArray[np.bool_]) -> int:
 def put_analysers(grid: Grid, analysers: Sequence[Tag], own: Mapping[str, Series]) -> list[Finding]:
     """Put the analysers' new readings ``own`` into the grid, and the rows that have one; what was seen of them.
 
-    RecordError for one with fewer than ``LEAST_READINGS`` of them, or with one in most rows.
+    RecordError for one with fewer than ``LEAST_NEW`` of them, or with one in most rows.
     """
     found = []
     for tag in analysers:
         value, fresh = on_rows(own[tag.tag], grid.time_s)
         n = int(np.count_nonzero(fresh))
-        if n < LEAST_READINGS:
+        if n < LEAST_NEW:
             raise RecordError(
-                f"{tag.tag} has {counted(n, 'new reading')} in {len(grid)} rows; an analyser needs {LEAST_READINGS} at "
+                f"{tag.tag} has {counted(n, 'new reading')} in {len(grid)} rows; an analyser needs {LEAST_NEW} at "
                 "least: give a longer export, or leave it out"
             )
-        if n > OFTEN * len(grid):
+        if n > NOT_SELDOM * len(grid):
             raise RecordError(
                 f"{tag.tag} has a new reading in {n} of {len(grid)} rows; it is no analyser: give it the role pv or "
                 f"constraint, or a shorter --period than {grid.period_s:g} s"

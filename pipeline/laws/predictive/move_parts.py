@@ -253,7 +253,7 @@ class ExplainedPredictive(nn.Module):
     def _finished(self, parts: Tensor, problem: PlanProblem, by: OperatedPlan, move: Tensor) -> Tensor:
         """All parts (..., n_mv, K) [mv] of the moves (..., n_mv), with those of the last plan.
 
-        The last plan carries over no more than it had planned. What the sweeps miss beyond that is spread over the
+        The last plan carries over no more than it had planned. All that the sweeps miss beyond that is spread over the
         causes by their size.
         """
         law, n_mv, stands = self.law, self.n_mv, problem.stands
