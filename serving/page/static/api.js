@@ -35,7 +35,7 @@ export async function change(wanted, token) {
   return found.done;
 }
 
-// What the law would do after changes by name; it changes nothing, so it needs no token.
+// Courses after changes by name; it changes nothing, so it needs no token.
 export async function foresee(changes) {
   const answer = await fetch("/api/what-if", {
     method: "POST",

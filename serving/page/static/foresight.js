@@ -1,4 +1,4 @@
-// What the law predicts and plans, and why it moves; and what it would do after a change. The page's server computes it
+// Courses that the law predicts and plans, why it moves, and what it would do after a change. The page's server computes it
 // beside the loop, from the inputs of the loop's last step.
 import { duration, element, figure, number, unit } from "./format.js";
 import { foresee, get } from "./api.js";

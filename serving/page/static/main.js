@@ -121,7 +121,7 @@ function show(found) {
   foreseen();
 }
 
-// What the law predicts is asked for with each state, and drawn once it is here.
+// A prediction is asked for with each state, and drawn once it is here.
 async function foreseen() {
   if (!about || !(await foresight.refresh())) return;
   faceplate.foreseen();
