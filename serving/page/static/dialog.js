@@ -63,7 +63,7 @@ function moves() {
   say($("dialog-moves"), said.join(", "));
 }
 
-// What the values would do, once the operator has stopped typing for a moment.
+// Courses under the values, once the operator has stopped typing for a moment.
 function look() {
   clearTimeout(looking);
   if (!pending.foresee) return;

@@ -1,4 +1,4 @@
-// What operators change of a law that reads `operate`: ranges, limits, uses, ranks, resting values, costs; signal by signal.
+// Numbers that operators change of a law that reads `operate`: ranges, limits, uses, ranks, resting values, costs; signal by signal.
 import { ask } from "./dialog.js";
 import * as foresight from "./foresight.js";
 import { duration, element, figure, number, say, unit } from "./format.js";
@@ -118,7 +118,7 @@ function moved(signal, what) {
   });
 }
 
-// What keeps a signal from being controlled as usual; with a level only where somebody is needed.
+// All that keeps a signal from being controlled as usual; with a level only where somebody is needed.
 function standing(group, signal, i) {
   if (group === "law") return null;
   const out = of(signal, "use") === 0;
@@ -204,5 +204,5 @@ export function askChange(group, signal) {
   });
 }
 
-// What the signals would do after a change, where the law can be asked for it.
+// Courses of the signals after a change, where the law can be asked for it.
 export const foresee = (changes) => (foresight.foresees() ? foresight.whatIf(changes, signals) : null);
