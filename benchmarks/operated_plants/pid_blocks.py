@@ -61,7 +61,7 @@ def searched(start: Array, cost: Callable[[Array], float]) -> Array:
                         tried = best.copy()
                         tried[i] *= by
                         found = cost(tried)
-                        if not found < least * (1 - 1e-3):
+                        if not found < least - 1e-3 * abs(least):
                             break
                         best, least, moved = tried, found, True
             if not moved:
