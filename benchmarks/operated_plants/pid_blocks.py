@@ -1,4 +1,4 @@
-"""Blocks of which engineers build control schemes: PI with tracking, selectors, feed-forward, and their tuning.
+"""Blocks of which engineers build control schemes: PI with tracking, selectors, feedforward, and their tuning.
 
 The rule of tuning: gains and reset times start where the plant's file has them, from its lags; then each number in
 turn is multiplied and divided by a factor that shrinks (1.6, 1.25, 1.1) as long as the cost of two days falls, whose
