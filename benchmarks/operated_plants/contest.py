@@ -42,6 +42,9 @@ def tuned_settings(plant: OperatedPlant, samples: int = TUNING_DAY, days: Sequen
     known = [
         plant.name,
         plant.title,
+        BEYOND,
+        TRAVEL,
+        COST,
         REST,
         samples,
         list(days),
