@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -16,7 +16,10 @@ from loopwright.serving.errors import ContractError, LoopError
 from loopwright.serving.fields import shown
 from loopwright.serving.guard import Guard, Sample
 from loopwright.serving.manifest import INPUTS, Manifest, Signal
+from loopwright.serving.mvs.in_hand import MvEntries, Those
+from loopwright.serving.mvs.local_mvs import none_left
 from loopwright.serving.operating import Operate
+from loopwright.serving.preview.course import Courses
 from loopwright.serving.words import first_line, named
 
 # ---------------------------------------------------------------------- a controller in a loop that reads more signals
@@ -49,6 +52,7 @@ class AdaptedController(Controller):
         dv: ArrayLike | None = None,
         operate: ArrayLike | None = None,
         fresh: ArrayLike | None = None,
+        ahead: ArrayLike | None = None,
     ) -> Step:
         """One step, on all PVs and measured disturbances of the loop."""
         step = self.inner.step(
@@ -59,6 +63,7 @@ class AdaptedController(Controller):
             dv=_picked(dv, self._dv, self.manifest.dv, "dv") if "dv" in self.inner.manifest.inputs else None,
             operate=operate,
             fresh=None if fresh is None else _picked(fresh, self._pv, self.manifest.pv, "fresh"),
+            ahead=None if ahead is None or self.manifest.ahead is None else self._known_ahead(ahead),
         )
         applied = np.asarray(mv_applied, dtype=np.float64).reshape(step.mv.shape)
         mv = [
@@ -66,6 +71,12 @@ class AdaptedController(Controller):
             for s, at, wanted in zip(self.manifest.mv, applied, step.mv, strict=True)
         ]
         return step._replace(mv=np.array(mv))
+
+    def _known_ahead(self, ahead: ArrayLike) -> Array:
+        """The numbers of ``ahead`` of the controller's own set points and measured disturbances."""
+        n_sp, loops = len(self.manifest.sp), len(self.manifest.sp) + len(self.manifest.dv)
+        own = [*range(n_sp), *(n_sp + place for place in self._dv)]
+        return np.asarray(ahead, dtype=np.float64).reshape(-1, loops)[:, own].ravel()
 
     def warm(self) -> None:
         """Compute a first step, as ``Controller.warm`` does."""
@@ -133,7 +144,9 @@ def _seen_as(own: Manifest, loop: Manifest) -> Manifest:
     if set(inputs) == set(own.inputs):
         inputs = own.inputs
     mv = tuple(replace(s, low=o.low, high=o.high) for s, o in zip(own.mv, loop.mv, strict=True))
-    return replace(own, pv=_ranged(loop.pv, own.pv), mv=mv, dv=_ranged(loop.dv, own.dv), inputs=inputs)
+    dv = _ranged(loop.dv, own.dv)
+    ahead = None if own.ahead is None else own.ahead.with_disturbances(dv)
+    return replace(own, pv=_ranged(loop.pv, own.pv), mv=mv, dv=dv, inputs=inputs, ahead=ahead)
 
 
 def _ranged(loop: Sequence[Signal], own: Sequence[Signal]) -> tuple[Signal, ...]:
@@ -176,6 +189,12 @@ def _inputs(controller: Controller, readings: Readings, operate: Array) -> dict[
     return found
 
 
+def _known(controller: Controller, courses: Courses | None, sp: Array, sample: Sample) -> dict[str, ArrayLike]:
+    """``ahead`` where a course says something to a law that reads it."""
+    found = None if courses is None else courses.ahead(controller.manifest, sp, sample.dv)
+    return {} if found is None else {"ahead": found}
+
+
 class Successor:
     """Steps a new controller on the samples of the one in charge; its MV is shown and not written.
 
@@ -190,6 +209,7 @@ class Successor:
         self.bridging = bridging or Bridging(controller.manifest)
         self.operating = Operate(controller.manifest.operate)
         self.operate = self.operating.default  # shape: (n_operate,)
+        self.mv_entries = MvEntries(controller.manifest)
         self.state = controller.cold_state()
         self.good = 0
         self.mv: Array | None = None  # shape: (n_mv,), of the last scan; None where there is none
@@ -202,8 +222,15 @@ class Successor:
         applied: Array,
         past: Collection[Sample] = (),
         wishes: Mapping[str, float] | None = None,
+        courses: Courses | None = None,
+        away: Those | None = None,
+        held: Array | None = None,
     ) -> None:
-        """One scan; ``past`` ends with the sample before it, ``wishes`` are values of ``operate`` that somebody set."""
+        """One scan; ``past`` ends with the sample before it, ``wishes`` are values of ``operate`` that somebody set.
+
+        ``courses`` are those of the loop, ``away`` (n_mv,) MVs that the plant has, ``held`` (n_mv,) what is commanded
+        of those out of use.
+        """
         try:
             self.operate = self.operating.taken_over(wishes or {})
         except ContractError as error:
@@ -218,7 +245,10 @@ class Successor:
                 self.miss(f"the set point {s.name} = {value:g} is outside its range [{s.low:g}, {s.high:g}] {s.unit}")
                 return
         try:
-            more = _inputs(self.controller, readings, self.bridging.used(self.operate, readings))
+            used, entries = self.bridging.used(self.operate, readings), self.mv_entries
+            out = ~entries.used(self.operate) | (entries.able & (False if away is None else away))
+            more = _inputs(self.controller, readings, entries.told(used, out, held, self.mv))
+            more |= _known(self.controller, courses, sp, sample)
             step: Step = self.controller.step(sp=sp, dv=sample.dv, mv_applied=applied, state=self.state, **more)
         except Exception as error:  # the controller in charge goes on, whatever this one does
             self.miss(named(error))
@@ -240,13 +270,26 @@ class Successor:
 Guards: TypeAlias = Sequence[Guard] | Callable[[Manifest], Sequence[Guard]]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class LawInputs:
+    """Inputs that a law was last stepped with: the same step can be computed again from them, and looked into.
+
+    ``values`` are by the inputs' names, of the loop's signals; ``unread_s`` (n_pv,) is the time since each PV was read
+    well, 0 where it was for this step.
+    """
+
+    values: Mapping[str, Array]
+    unread_s: Array
+
+
 class ActiveController:
     """The controller in charge with the state of its law, its guards and the samples that they look back to.
 
     ``guards`` are a host's own, or what makes them for a controller's manifest: they are then made anew for each
     controller that takes over. ``bridge_s`` and ``critical`` are of ``Bridging``. ``wishes`` are the values of
     ``operate`` that somebody has set since the loop began, by name: they outlast a law that lacks them. ``operate``
-    (n_operate,) is those that the law in charge has, and its own defaults for the rest.
+    (n_operate,) is those that the law in charge has, and its own defaults for the rest. ``stepped`` has the inputs of
+    its last step.
     """
 
     def __init__(
@@ -258,16 +301,28 @@ class ActiveController:
         self.operating = Operate(controller.manifest.operate)
         self.operate = self.operating.default
         self.wishes: dict[str, float] = {}
+        self.courses = Courses(controller.manifest)  # of set points and measured disturbances, whoever is in charge
         self._made = guards if callable(guards) else None
         self.guards: tuple[Guard, ...] = tuple(guards(controller.manifest) if callable(guards) else guards)
         self._bridging = Bridging(controller.manifest, bridge_s, critical)
+        self.mv_entries = MvEntries(controller.manifest)
         self._state = controller.cold_state()
+        self.stepped: LawInputs | None = None
+        self._given: Array | None = None  # shape: (n_mv,), what the law gave last; None without a past
         self._past = deque[Sample](maxlen=_longest(self.guards))
         self._before: tuple[Sample, ...] = ()  # the past of the present sample, for the successor
 
-    def look(self, sample: Sample) -> Readings:
-        """The readings of a sample that the law may act on, or why it may not."""
+    @property
+    def in_hand(self) -> Those:
+        """The MVs (n_mv,) that operators have taken out."""
+        return ~self.mv_entries.used(self.operate)
+
+    def look(self, sample: Sample, local: Mapping[str, str]) -> Readings:
+        """The readings of a sample that the law may act on, or why it may not; the plant has the MVs ``local``."""
         readings = self._bridging.look(sample, self.guards, self._past, self.operate)
+        if not readings.reason and local:
+            why = none_left(self.controller.manifest.mv, local, self.mv_entries.used(self.operate))
+            readings = replace(readings, reason=why)
         if readings.reason and self.successor is not None:
             self.successor.bridging.missed()
         return readings
@@ -282,34 +337,56 @@ class ActiveController:
         try:
             return self.operating.with_values(values, self.operate)
         except ContractError as error:
-            raise LoopError(first_line(error)) from error
+            refused = LoopError(first_line(error))
+            refused.entry = error.entry
+            raise refused from error
 
     def set_operate(self, values: Mapping[str, float]) -> None:
         """Change some of ``operate``; LoopError as ``operate_with``, and nothing is changed then."""
         self.operate = self.operate_with(values)
         self.wishes |= {name: float(self.operate[self.operating.places[name]]) for name in values}
 
-    def step(self, readings: Readings, sp: Array, applied: Array) -> Step:
-        """One step of the law. It raises what the law raises; ``forget`` then, as the state is of no use any more."""
+    def require_ahead(self) -> None:
+        """LoopError for a law that does not read what is to come."""
+        m = self.controller.manifest
+        if "ahead" not in m.inputs:
+            raise LoopError(f"{m.law} has no ahead: it cannot be given a course; design it with `preview: course`")
+
+    def step(self, readings: Readings, sp: Array, applied: Array, out: Those, held: Array | None) -> Step:
+        """One step of the law. It raises what the law raises; ``forget`` then, as the state is of no use any more.
+
+        ``out`` (n_mv,) are the MVs out of use, by operators' word or the plant's, ``held`` (n_mv,) what is commanded
+        of these now; None: nothing is.
+        """
         sample = readings.sample
         self._before = tuple(self._past) if self.successor is not None else ()
-        more = _inputs(self.controller, readings, self._bridging.used(self.operate, readings))
-        step = self.controller.step(sp=sp, dv=sample.dv, mv_applied=applied, state=self._state, **more)
+        used = self.mv_entries.told(self._bridging.used(self.operate, readings), out, held, self._given)
+        more = _inputs(self.controller, readings, used)
+        more |= _known(self.controller, self.courses, sp, sample)
+        given = {"sp": sp, "dv": sample.dv, "mv_applied": applied, "state": self._state, **more}
+        step = self.controller.step(**given)
+        read = self.controller.manifest.inputs  # another one may hold anything
+        values = {n: np.array(given[n], dtype=np.float64) for n in read if n in given}  # hosts reuse their arrays
+        self.stepped = LawInputs(values, self._bridging.unread_s)
         if self._past.maxlen:
             self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
-        self._state = step.state
+        self._state, self._given = step.state, np.array(step.mv)  # the host gets step.mv, may write into it
         return step
 
-    def beside(self, sample: Sample, sp: Array, applied: Array) -> Array | None:
+    def beside(
+        self, sample: Sample, sp: Array, applied: Array, away: Those | None = None, held: Array | None = None
+    ) -> Array | None:
         """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
         new = self.successor
         if new is None:
             return None
-        new.step(sample, sp, applied, self._before, self.wishes)
+        new.step(sample, sp, applied, self._before, self.wishes, self.courses, away, held)
         if new.ready:
             self.replaced, self.successor = self.controller, None
-            self.controller, self._state = new.controller, new.state
+            self.controller, self._state, self.stepped = new.controller, new.state, None
+            self._given = new.mv
             self.operating, self.operate, self._bridging = new.operating, new.operate, new.bridging
+            self.mv_entries = new.mv_entries
             if self._made is not None:
                 self.guards = tuple(new.guards)
                 self._past = deque(self._past, maxlen=_longest(self.guards))
@@ -336,7 +413,7 @@ class ActiveController:
 
     def begin_cold(self, reason: str) -> None:
         """The laws know nothing of what was."""
-        self._state = self.controller.cold_state()
+        self._state, self._given = self.controller.cold_state(), None
         if self.successor is not None:
             self.successor.miss(reason)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import nearest, shown
-from loopwright.serving.guard import Fault, Guard, Sample, refused, refused_apart, reworded
+from loopwright.serving.guard import Fault, Guard, Sample, lasting, refused, refused_apart, reworded
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.words import first_line
 
@@ -89,6 +89,11 @@ class Bridging:
         made._last, made._gone = self._last.copy(), self._gone.copy()
         made._excused, made._why = self._excused.copy(), dict(self._why)
         return made
+
+    @property
+    def unread_s(self) -> Array:
+        """Time since each PV (n_pv,) was read well [s]; 0 for all of a law that takes a whole sample or none."""
+        return self._gone * self.manifest.period_s if self._apart else np.zeros(len(self._gone))
 
     def missed(self, periods: int = 1) -> None:
         """Periods without a sample."""
@@ -169,7 +174,7 @@ class Bridging:
         self._excused[[i for i in np.flatnonzero(stale).tolist() if i not in self._why]] += 1.0
         if good.all():  # a sum of finite numbers may overflow
             return Readings(sample, "", pv, self._all_fresh)
-        bridged, shed = dict[str, str](), dict[str, str]()
+        bridged, shed, needed = dict[str, str](), dict[str, str](), dict[str, str]()
         for i in np.flatnonzero(~good).tolist():
             name = m.pv[i].name
             why = self._why.get(i, "")
@@ -181,12 +186,20 @@ class Bridging:
             if (self._gone[i] - self._excused[i] - 1) * m.period_s < self.bridge_s:
                 bridged[name] = why
             elif name in self.critical or name not in self._of_use:
-                lost = "the loop needs this PV" if name in self.critical else "the law cannot leave this PV out"
-                return Readings(sample, reworded(why, f"{why}; {lost}"))
+                needed[name] = why
             else:
                 shed[name] = why
+        if needed:
+            return Readings(sample, _without(needed, "the loop needs it, or the law cannot leave it out"))
         wanted = [name for name, place in self._of_use.items() if operate[place] > 0]
         if shed and wanted and not set(wanted) - set(shed):
-            why = next(iter(shed.values()))
-            return Readings(sample, reworded(why, f"{why}; no controlled variable is left"))
+            return Readings(sample, _without(shed, "no controlled variable is left"))
         return Readings(sample, "", np.where(good, pv, self._last), good.astype(np.float64), bridged, shed)
+
+
+def _without(those: Mapping[str, str], end: str) -> Fault:
+    """A fault of all of these PVs, each with its reason."""
+    kinds = {why.kind if isinstance(why, Fault) else "" for why in those.values()}
+    subjects = ", ".join(f"PV {name}" for name in those)
+    lasts = "; ".join(lasting(why) for why in those.values())
+    return Fault(f"{'; '.join(those.values())}; {end}", ", ".join(sorted(kinds)), subjects, f"{lasts}; {end}")

@@ -25,6 +25,7 @@ SHOWN = {
     "swings",
     "beyond_reach",
     "calmed",
+    "operated",
 }  # entries of the evidence that have a place of their own
 
 
@@ -170,7 +171,18 @@ def _evidence(evidence: dict[str, Any]) -> list[str]:
     for name, row in rows.items():
         cells = (f"{row[c]:.4g}" if isinstance(row.get(c), int | float) else "-" for c in columns)
         lines.append(f"  {name:<{first}}" + "".join(f"  {c:>{w}}" for c, w in zip(cells, widths, strict=True)))
+    operated = evidence.get("operated")
+    lines += _operated(operated) if isinstance(operated, dict) else []
     return lines + _tree({k: v for k, v in evidence.items() if rows is not evidence and k not in SHOWN})
+
+
+def _operated(tests: dict[str, Any]) -> list[str]:
+    """Tests in which operators change ranges, MVs in use, costs and ranks, a line each."""
+    lines = []
+    for test, row in tests.items():
+        known = {k: v for k, v in row.items() if isinstance(v, int | float)} if isinstance(row, dict) else {}
+        lines.append(f"  {test}: " + ", ".join(f"{name} {value:.4g}" for name, value in known.items()))
+    return ["  operators' changes (shares of time, of the gain, of the violation, of ranges)", *lines] if lines else []
 
 
 def _tree(values: dict[str, Any], indent: int = 2) -> list[str]:

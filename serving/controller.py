@@ -19,7 +19,8 @@ from loopwright.serving.errors import ArtifactError, ContractError, LoopwrightEr
 from loopwright.serving.graph.audit import audit
 from loopwright.serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
 from loopwright.serving.operating import Operate
-from loopwright.serving.ranges import numbers
+from loopwright.serving.preview.differences import Differences
+from loopwright.serving.ranges import numbers, switched
 
 LONGEST_STEP_S = 1.0  # a fork waits no longer for a step
 _locks: WeakSet[Lock] = WeakSet()  # of all controllers of this process
@@ -98,7 +99,7 @@ class Controller:
             data = read_controller(self.path, sha256)
             self.summary = audit(data)
             self.manifest = _manifest(self.summary.metadata)
-            self._session = _session(data)
+            self._session = session_of(data)
             _agree(self.manifest, self._session)
         except ArtifactError as error:
             raise ArtifactError(f"{self.path}: {error}") from error.__cause__
@@ -121,6 +122,7 @@ class Controller:
         dv: ArrayLike | None = None,
         operate: ArrayLike | None = None,
         fresh: ArrayLike | None = None,
+        ahead: ArrayLike | None = None,
     ) -> Step:
         """One step of the law, in engineering units.
 
@@ -139,19 +141,23 @@ class Controller:
             1 for each process variable whose reading is new and good, 0 for one that is neither, shape (n_pv,); None:
             all are. The number in ``pv`` must be finite all the same. It is not used, but for a first step without a
             past, which has nothing else to begin from: give the last good one.
+        ahead
+            By how much set points and measured disturbances will differ from ``sp`` and ``dv`` at the samples to come,
+            shape (N n,), as the manifest's ``ahead`` lists them; None: they stay. See ``loopwright.serving.preview``.
 
         Raises
         ------
         ContractError
             An input has the wrong shape or type, or is missing; an entry of ``operate`` is outside its engineered
-            range, or ``fresh`` is neither 0 nor 1.
+            range, ``fresh`` is neither 0 nor 1, ``ahead`` leaves a signal's range; the law does not read one of these
+            three that is given.
         SampleError
             An input is not finite: no MV is computed from it.
         OutputError
             The law's output is not finite, lies outside the MV's range, or is further from ``mv_applied`` than the
             MV moves in a period (``max_move``).
         """
-        given = (sp, pv, dv, mv_applied, state, *self._operated(operate, fresh))
+        given = (sp, pv, dv, mv_applied, state, *self._operated(operate, fresh), self._known(ahead, sp, dv))
         with self._lock:
             for place, name, buffer, shape in self._inputs:
                 value = given[place]
@@ -235,8 +241,10 @@ class Controller:
         self._out, outs = _vectors([len(m.mv), m.n_state, len(m.info)])
         starts = [(p.ctypes.data - self._out.ctypes.data) // 8 for p in outs]
         self._cuts = (len(m.mv), starts[1], starts[1] + m.n_state, starts[2], starts[2] + len(m.info))
-        self._operate = Operate(m.operate) if "operate" in m.inputs or "fresh" in m.inputs else None
+        self._operate = Operate(m.operate) if "operate" in m.inputs else None
+        self._reads_fresh = "fresh" in m.inputs
         self._all_fresh = np.ones(len(m.pv))
+        self._ahead = Differences(m.ahead) if m.ahead is not None and "ahead" in m.inputs else None
         self._ranges = [(s.low, s.high, s.values) for s in m.mv]
         begins = next(
             ((part.ctypes.data - self._in.ctypes.data) // 8 for _, n, part, _ in self._inputs if n == "mv_applied"), 0
@@ -254,14 +262,34 @@ class Controller:
     def _operated(self, operate: ArrayLike | None, fresh: ArrayLike | None) -> tuple[Any, Any]:
         """``operate`` and ``fresh``, checked; their defaults where there are none."""
         if self._operate is None:
-            return None, None
-        operate = self._operate.default if operate is None else self._operate.checked(operate)
+            self._require_none("operate", operate)
+        else:
+            operate = self._operate.default if operate is None else self._operate.checked(operate)
+        if not self._reads_fresh:
+            self._require_none("fresh", fresh)
+            return operate, None
         if fresh is None:
             return operate, self._all_fresh
-        known = self._vector("fresh", fresh, len(self.manifest.pv))
+        known = self._vector("fresh", switched(fresh), len(self.manifest.pv))
         if not ((known == 0) | (known == 1)).all():
             raise ContractError(f"fresh is {known.tolist()}; each is 1 for a new and good reading, or 0")
         return operate, known
+
+    def _known(self, ahead: ArrayLike | None, sp: ArrayLike, dv: ArrayLike | None) -> Any:
+        """``ahead``, checked; zeros where there is none."""
+        if self._ahead is None:
+            self._require_none("ahead", ahead)
+            return None
+        if ahead is None:
+            return self._ahead.none
+        m = self.manifest
+        present = [self._vector("sp", sp, len(m.sp)), *([self._vector("dv", dv, len(m.dv))] if m.dv else [])]
+        return self._ahead.checked(ahead, np.concatenate(present))
+
+    def _require_none(self, name: str, given: object) -> None:
+        if given is not None:
+            m = self.manifest
+            raise ContractError(f"the law {m.law!r} does not read {name}; its inputs are {', '.join(m.inputs)}")
 
     def _reset(self) -> None:
         """Inputs that any law can be warmed with: the middle of each range, no past."""
@@ -344,7 +372,7 @@ def _manifest(metadata: dict[str, str]) -> Manifest:
     return Manifest.from_json(metadata[MANIFEST_KEY])
 
 
-def _session(data: bytes) -> Any:
+def session_of(data: bytes) -> Any:
     """An onnxruntime session for one small graph in a control loop: one thread that never spins."""
     import onnxruntime as ort  # here, so that `import serving` costs nothing
 

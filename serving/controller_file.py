@@ -97,6 +97,15 @@ def _differs(found: Any, wanted: Any, where: str) -> str:
     return next(filter(None, (_differs(f, w, f"{where}.{key}".lstrip(".")) for key, f, w in pairs)), "")
 
 
+# ------------------------------------------------------------------------------------------------- files in a folder
+EXPLAIN_SUFFIX = ".explain.onnx"  # of the graph beside a controller's file that says why it moves
+
+
+def controller_files(folder: Path) -> list[Path]:
+    """The controllers' files of a folder, by name; graphs that explain them are none."""
+    return sorted(path for path in folder.glob("*.onnx") if not path.name.endswith(EXPLAIN_SUFFIX))
+
+
 # ------------------------------------------------------------------------------------------------- reading a file
 def read_controller(path: Path, pinned: str | None) -> bytes:
     """The bytes of a controller's file, read once: what is checked is what is loaded.

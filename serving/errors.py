@@ -15,7 +15,12 @@ from __future__ import annotations
 
 
 class LoopwrightError(Exception):
-    """Base of every error that Loopwright raises on purpose; its text is one line for a person."""
+    """Base of every error that Loopwright raises on purpose; its text is one line for a person.
+
+    ``entry`` names the entry of ``operate`` that is wrong; empty where it is none.
+    """
+
+    entry = ""
 
 
 class ArtifactError(LoopwrightError):

@@ -58,12 +58,18 @@ def _bits(value: int) -> int:
 T = TypeVar("T")
 
 
+MOST_KNOWN = 12  # names in a message: a longer list hides the one that is meant
+
+
 def nearest(word: object, known: Iterable[str]) -> str:
-    """The end of an error message: the nearest known word, or all of them."""
-    names = sorted(str(k) for k in known)
-    close = difflib.get_close_matches(word if isinstance(word, str) else shown(word), names, n=1)
+    """The end of an error message: the nearest known word, and all of them, or the nearest of many."""
+    names, asked = sorted(str(k) for k in known), word if isinstance(word, str) else shown(word)
+    close = difflib.get_close_matches(asked, names, n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ";"
-    return f"{hint} known: {', '.join(names) or 'none'}"
+    if len(names) <= MOST_KNOWN:
+        return f"{hint} known: {', '.join(names) or 'none'}"
+    few = sorted(difflib.get_close_matches(asked, names, n=MOST_KNOWN // 2, cutoff=0.0))
+    return f"{hint} the nearest of {len(names)}: {', '.join(few)}"
 
 
 def parse(cls: type[T], values: Any, where: str, error: type[Exception]) -> T:

@@ -113,7 +113,8 @@ def _ending(status: int) -> str:
 def take(loaded: controller.Controller) -> None:
     """The first steps: the middle of every range, then both ends of each kind of input, a few in a row from no past.
 
-    A law that reads ``operate`` and ``fresh`` is also stepped with all its entries low, all high, and nothing fresh.
+    A law that reads ``operate`` and ``fresh`` is also stepped with all its entries low, all high, and nothing fresh;
+    one that reads ``ahead`` with all that is to come low, and high.
 
     Raises ArtifactError where onnxruntime cannot compute one, or where no step at all gives an MV. A law may refuse
     some of these inputs: in a loop that is a fault, which no process dies of.
@@ -148,6 +149,12 @@ def _inputs(m: Manifest) -> Iterator[dict[str, np.ndarray]]:
             yield middle | {"operate": np.array([getattr(entry, end) for entry in m.operate])}
     if "fresh" in m.inputs:
         yield middle | {"fresh": np.zeros(len(m.pv))}
+    if "ahead" in m.inputs and m.ahead is not None:
+        present = np.array([(s.low + s.high) / 2 for s in m.ahead.signals])
+        for end in ("low", "high"):
+            there = np.array([getattr(s, end) for s in m.ahead.signals])
+            known = np.tile(there - present, m.ahead.horizon)
+            yield middle | {"sp": present[: len(m.sp)], "dv": present[len(m.sp) :], "ahead": known}
 
 
 def main(path: str, sha256: str | None = None) -> int:

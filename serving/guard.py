@@ -96,6 +96,9 @@ class Sample:
     results. It is neither judged nor used, the law predicts the PV for as long as it takes, and nothing is wrong.
     Any other law takes the number that stands there.
 
+    ``local`` says for each MV why the plant has it itself now, as in local, empty where the loop has it; an empty
+    tuple: it has all. A law with ``use`` of the MV goes on with the others, see ``loopwright.serving.mvs``.
+
     ``last_pv`` and ``since`` are for guards, and none of the endpoint's: the loop of such a law shows by them the last
     good number of each PV, NaN where there is none, and how many periods ago it was read.
     """
@@ -111,6 +114,7 @@ class Sample:
     fresh: Array | None = None  # shape: (n_pv,), 1 or 0; None: all are
     last_pv: Array | None = None  # shape: (n_pv,)
     since: Array | None = None  # shape: (n_pv,), in periods, 1 or more
+    local: tuple[str, ...] = ()  # shape: (n_mv,), or empty
 
     def is_bad(self, i: int) -> bool:
         """Whether the reading of PV ``i`` is known to be bad, or none: no guard judges it again."""

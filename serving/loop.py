@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from math import inf, isnan, nan
 from typing import TypeAlias
@@ -10,14 +10,16 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.active_controller import ActiveController, Guards, Successor
+from loopwright.serving.active_controller import ActiveController, Guards, LawInputs, Successor
 from loopwright.serving.clock import Clock, MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Guard, Sample, default_guards, reworded
-from loopwright.serving.modes import ByHand, Command, Fallback, LoopMode, Mode, Transfer, mode_of
+from loopwright.serving.modes import Command, Fallback, LoopMode, Mode, Transfer, mode_of
 from loopwright.serving.mv_readback import AppliedMV
+from loopwright.serving.mvs.out_of_use import OutOfUse
+from loopwright.serving.preview.course import Courses, Points
 from loopwright.serving.ranges import within
 from loopwright.serving.scan_grid import RunReport, run_on_grid
 from loopwright.serving.words import first_line
@@ -37,12 +39,11 @@ class ControlLoop:
     nothing: the law is stepped on what others do with the plant. A fault in AUTO changes the mode to
     HOLD, and the command names the reason; ``recover_after`` good samples change it back. A fault that
     lasts is for ``fallback``. After a gap the law starts cold (state = 0). A law that reads ``fresh`` goes on without a
-    PV whose reading alone is bad; the command names it.
+    PV whose reading alone is bad; the command names it. One with ``use`` of an MV goes on without that MV, where an
+    operator has it in hand or the plant has it itself, see ``loopwright.serving.mvs``.
 
-    A command that did not reach the plant (``unwritten``) leaves it unknown where the MV stands: others may move it
-    meanwhile. The next read-back tells, also that of a sample which is refused for another reason. HOLD, MANUAL and
-    the fallback go on from there, and nothing writes an old MV over it. Nothing is written while the read-back is bad,
-    nor, where the MV stands outside its range, until it is back. A plant that reads nothing back gets the old MV.
+    After a command that did not reach the plant (``unwritten``), HOLD, MANUAL and the fallback go on from where the MV
+    stands, see ``loopwright.serving.mv_readback.AppliedMV``.
 
     Every written MV lies in its range, in every mode and with any guards; a discrete MV has one of its values. An MV
     moves by at most its ``max_move`` a period: a law that gives more has a fault, the fallback and an operator's MV
@@ -51,17 +52,12 @@ class ControlLoop:
 
     Parameters
     ----------
-    controller
-        The law.
-    endpoint
-        Reads and writes the plant; only ``run`` needs it.
-    sp
-        Set points (n_sp,).
+    controller, endpoint
+        The law, and what reads and writes the plant; only ``run`` needs that.
+    sp, mode
+        Set points (n_sp,) and mode at the start.
     mv
-        The MV that the plant has now (n_mv,): the start value of HOLD and MANUAL. None: it is not known. The loop then
-        writes nothing until a good sample has a read-back, and begins from there.
-    mode
-        Mode at the start.
+        The MV that the plant has now (n_mv,). None: it is not known; nothing is written until a good sample tells.
     guards
         Checks that can refuse a sample, or what makes them for a controller's manifest: they are then made anew for
         each controller that takes over. ``default_guards`` unless given.
@@ -83,6 +79,8 @@ class ControlLoop:
     bridge_s, critical
         Time for which the bad reading of a PV is bridged [s], ten periods unless given, and the names of PVs without
         which the loop holds after it. See ``loopwright.serving.bridging``.
+    local_s
+        Time for which an MV may be elsewhere than it was commanded [s], see ``loopwright.serving.mvs.local_mvs``.
 
     Raises
     ------
@@ -108,6 +106,7 @@ class ControlLoop:
         operate: Mapping[str, float] | None = None,
         bridge_s: float | None = None,
         critical: Sequence[str] = (),
+        local_s: float | None = None,
     ) -> None:
         mode = mode_of(mode)
         if recover_after is not None and recover_after < 1:
@@ -117,6 +116,7 @@ class ControlLoop:
         manifest = controller.manifest
         guards = default_guards if guards is None else guards
         self._active = ActiveController(controller, guards, bridge_s=bridge_s, critical=critical)
+        self._out = OutOfUse(manifest.mv, manifest.period_s, local_s)
         if operate:
             self.set_operate(operate)
         self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
@@ -139,7 +139,7 @@ class ControlLoop:
         self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
-        self._hand = ByHand()
+        self._took_over = False  # whether a shadow has just ended: others may have moved the MV
 
     # ------------------------------------------------------------------ who is in charge
     @property
@@ -161,6 +161,11 @@ class ControlLoop:
     def guards(self) -> tuple[Guard, ...]:
         """The guards of the controller in charge."""
         return self._active.guards
+
+    @property
+    def stepped(self) -> LawInputs | None:
+        """Inputs of the law's last step; None before the first one of the controller in charge."""
+        return self._active.stepped
 
     def swap(self, controller: Controller, trial: int) -> None:
         """Try ``controller`` for ``trial`` good scans in a row beside the one in charge, then give it the plant.
@@ -193,7 +198,12 @@ class ControlLoop:
     @property
     def mv_wanted(self) -> Array:
         """Where the MV goes by hand, shape (n_mv,); the last commanded one where it is there."""
-        return self._mv.copy() if self._hand.wanted is None else self._hand.wanted.copy()
+        return self._out.hand.goal(self._mv)
+
+    @property
+    def local(self) -> dict[str, str]:
+        """The MVs that the plant has itself, each with the reason."""
+        return dict(self._out.local.why)
 
     @property
     def fault(self) -> str:
@@ -203,22 +213,43 @@ class ControlLoop:
     def set_mode(self, mode: Mode) -> None:
         """Set the mode, as a Mode or its name; it takes effect at the next scan.
 
-        LoopError for another word, and where a shadow that knows no good sample now is to move the plant: where the MV
-        stands is not known.
+        LoopError for another word, and where a shadow that has no good sample now is to move the plant.
         """
         mode = mode_of(mode)
         if self.mode is Mode.SHADOW and mode is not Mode.SHADOW and self._refused_why:
-            raise LoopError(
-                f"the last sample was refused ({self._refused_why}): where the MV stands is not known; wait"
-            )
+            why = f"the last sample was refused ({self._refused_why})"
+            raise LoopError(f"{why}: where the MV stands is not known; wait")
         if mode is not self.mode:
             self._transfer.begin()
-            self._hand.wanted = None
+            self._out.begun(mode, self._active.in_hand)
+            self._took_over = self.mode is Mode.SHADOW
         self._mode.set(mode)
 
-    def set_sp(self, sp: ArrayLike) -> None:
-        """Change the set points (n_sp,); LoopError outside their ranges."""
-        self._sp = within(sp, self.controller.manifest.sp, "set point")
+    def set_sp(self, sp: ArrayLike) -> tuple[str, ...]:
+        """Change the set points (n_sp,), whose courses end; the names of those. LoopError outside their ranges."""
+        before, self._sp = self._sp, within(sp, self.controller.manifest.sp, "set point")
+        moved = zip(self.manifest.sp, before.tolist(), self._sp.tolist(), strict=True)
+        return self.courses.end([s.name for s, old, new in moved if old != new])
+
+    @property
+    def courses(self) -> Courses:
+        """The courses of set points and measured disturbances; ``set_course`` gives some, and its ``end`` ends them."""
+        return self._active.courses
+
+    def set_course(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> None:
+        """Give known set points and forecasts of measured disturbances, by name, as points (time [s], value).
+
+        Times count from the next scan on. Set points and the law follow them in every mode, see ``Courses``; ``set_sp``
+        ends the course of a set point. LoopError for a law that does not read ``ahead``, and for points that cannot be;
+        then nothing is changed.
+        """
+        self.require_course(points, straight)
+        self.courses.give(points, straight)
+
+    def require_course(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> None:
+        """LoopError where ``set_course`` would refuse."""
+        self._active.require_ahead()
+        self.courses.checked(points, straight)
 
     @property
     def operate(self) -> Array:
@@ -232,22 +263,33 @@ class ControlLoop:
         ``operate``, an unknown name, and a value that is not allowed; then nothing is changed.
         """
         self._active.set_operate(values)
+        self._out.operated(values)
+
+    @property
+    def wishes(self) -> dict[str, float]:
+        """The values of ``operate`` that somebody has set since the loop began, by name."""
+        return dict(self._active.wishes)
 
     def operate_with(self, values: Mapping[str, float]) -> Array:
         """``operate`` (n_operate,) as ``set_operate`` would leave it; LoopError where that would refuse."""
         return self._active.operate_with(values)
 
     def set_mv(self, mv: ArrayLike) -> None:
-        """Set the MV (n_mv,) in MANUAL; one with a ``max_move`` goes there scan by scan, see ``mv_wanted``.
+        """Set the MV (n_mv,) by hand; one with a ``max_move`` goes there scan by scan, see ``mv_wanted``.
 
-        LoopError outside its range, in another mode, and after a command that did not reach the plant, until it is
-        known where the MV stands.
+        LoopError outside its range, for a change that ``require_in_hand`` refuses, and until it is known where the MV
+        stands after a command that did not reach the plant.
         """
-        if self.mode is not Mode.MANUAL:
-            raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {self.mode}")
+        wanted = within(mv, self.controller.manifest.mv, "MV")
+        self.require_in_hand(self._out.others(self._mv, wanted))
         if self._applied.lost:
             raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
-        self._mv = self._hand.sent(self._mv, within(mv, self.controller.manifest.mv, "MV"), self.controller.manifest.mv)
+        self._mv = self._out.hand.sent(self._mv, wanted, self.controller.manifest.mv)
+        self._took_over = self._took_over and self._out.hand.wanted is not None  # else the MV is where it was sent
+
+    def require_in_hand(self, names: Collection[str]) -> None:
+        """LoopError unless operators have these MVs in hand: all in MANUAL, those of ``use`` 0 in AUTO and HOLD."""
+        self._out.require(names, self.mode, self._active.mv_entries, self._active.operate)
 
     def hand_back(self) -> None:
         """The plant is with its own controller now: this loop writes no more, until the mode is set again."""
@@ -256,11 +298,15 @@ class ControlLoop:
     # ------------------------------------------------------------------ one scan
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
-        readings = self._active.look(sample)
+        self._sp = self.courses.followed(self._sp)
+        sample = self._out.look(sample, self._active.mv_entries, lost=self._applied.lost)
+        readings = self._active.look(sample, self._out.local.why)
         reason, self._refused_why = readings.reason, ""
         self._applied.arrived()
-        shown = self._applied.look(sample, self._mv, refused=bool(reason))
+        shown = self._applied.look(sample, self._mv, refused=bool(reason), theirs=self._out.local.away)
         self.found = shown.found
+        if self._took_over and shown.applied is not None:
+            self._mv = shown.applied.copy()
         if shown.silent:
             if shown.outside:
                 self._mv = np.full(len(self._mv), nan)
@@ -268,7 +314,8 @@ class ControlLoop:
             both = shown.silent if doubled else reworded(reason, f"{reason}; {shown.silent}")
             return self._without_sample(both, silent=True)
         if self.found is not None:
-            self._mv, self._hand.wanted = self.found.copy(), None
+            self._mv, self._out.hand.wanted = self.found.copy(), None
+        self._mv = self._out.follow(self._mv, shown.applied, self._applied, self.mode, self._active.in_hand)
         if reason:
             return self._without_sample(reason)
         applied = self._mv if shown.applied is None else shown.applied
@@ -279,39 +326,42 @@ class ControlLoop:
                 applied = self._applied.read_back(sample, self._mv)
             if isnan(self._mv[0]):
                 self._mv = applied.copy()
-            step = self._active.step(readings, self._sp, applied)
+            self._mv = self._out.hand.toward(self._mv, self.controller.manifest.mv)
+            held = None if self.mode is Mode.SHADOW else self._mv
+            step = self._active.step(readings, self._sp, applied, self._out.those, held)
         except Exception as error:  # the plant needs an MV after any error
             if self.mode in {Mode.AUTO, Mode.SHADOW}:
-                self._mv = applied
-            return self._without_sample(first_line(error))
+                self._mv = self._out.without(self._mv, applied)
+            return self._without_sample(first_line(error), by_hand=False)
         # Once it was asked, the plant's own controller may have the plant already.
         if self.fault and not self._handing_back() and self._mode.recovers(self.recover_after):
             self.set_mode(Mode.AUTO)
         if self.mode is Mode.AUTO:
-            self._mv = np.array(self._transfer.limited(step.mv, applied))  # the host gets step.mv, may write into it
+            self._mv = self._out.without(self._mv, self._transfer.limited(step.mv, applied))
         elif self.mode is Mode.SHADOW:
             self._mv = applied.copy()
-        self._mv = self._hand.toward(self._mv, self.controller.manifest.mv)
         before = self.controller
-        beside = self._active.beside(readings.sample, self._sp, applied)
+        beside = self._active.beside(readings.sample, self._sp, applied, self._out.local.away, held)
         if self.controller is not before:
             self._transfer.begin()
         self._lasting()
         command = self._command(step.mv, step.info, self.fault, beside)
-        bad = readings.bridged or readings.shed
-        return replace(command, bridged=readings.bridged, shed=readings.shed) if bad else command
+        good = not (readings.bridged or readings.shed)
+        return command if good else replace(command, bridged=readings.bridged, shed=readings.shed)
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
         self._applied.arrived()
         self.found = None
+        self._sp = self.courses.followed(self._sp)
         self._active.missed(1)
         return self._without_sample(reason)
 
-    def _without_sample(self, reason: str, *, silent: bool = False) -> Command:
+    def _without_sample(self, reason: str, *, silent: bool = False, by_hand: bool = True) -> Command:
         self._refused_why = reason = reason or "a fault without a reason"
         self._lose(reason)
-        self._mv = self._mv if silent else self._hand.toward(self._mv, self.controller.manifest.mv)
+        if by_hand and not silent:
+            self._mv = self._out.hand.toward(self._mv, self.controller.manifest.mv)
         self._lasting(moves=not silent)
         command = self._command(None, None, reason)
         return replace(command, mv=np.full(len(self._mv), nan)) if silent else command
@@ -321,16 +371,18 @@ class ControlLoop:
 
         Where the scan has found that the MV stands elsewhere, it stays there.
         """
-        if self.mode is not Mode.MANUAL or self._hand.wanted is not None:
+        if self.mode is not Mode.MANUAL or self._out.hand.wanted is not None:
             self._mv = np.array(before if self.found is None else self.found, dtype=np.float64)
         self._applied.lose()
         self._lose(reason)
         self._scan -= 1
+        self.courses.passed(-1)  # this scan is counted already
         return self._command(None, None, reason)
 
     def gap(self, periods: int) -> None:
         """So many periods passed without a scan; the law starts cold after more than ``max_gap``."""
         self._active.missed(periods)
+        self.courses.passed(periods)
         if periods > self.max_gap:
             self._active.begin_cold(f"{periods} periods were missed")
             self._transfer.begin()  # a law that starts cold may want another MV at once
@@ -344,16 +396,21 @@ class ControlLoop:
         """Count the scans of a fault, and go where the fallback says once it has lasted."""
         self._mode.hold()
         if moves and self.fallback is not None and self._mode.overdue(self.fallback, self.manifest.period_s):
-            self._mv = self.fallback.toward(self._mv, self.controller.manifest.mv, self.manifest.period_s)
+            safe = self.fallback.toward(self._mv, self.controller.manifest.mv, self.manifest.period_s)
+            self._mv = self._out.without(self._mv, safe)
 
     def _handing_back(self) -> bool:
         return self._mode.handing_back(self.fallback, self.manifest.period_s)
 
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
+        self.courses.over()
+        self.courses.passed(1)
+        self._took_over = False
         back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
-        command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back)
+        command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back, local=self.local)
         self._applied.command(self._mv, written=command.writes)
+        self._out.local.commanded(self._mv, written=command.writes)
         return command
 
     # ------------------------------------------------------------------ running
@@ -368,20 +425,8 @@ class ControlLoop:
     ) -> RunReport:
         """Scan once a period for ``n`` periods, or until ``until`` returns True after a scan, or ``stop`` before one.
 
-        Deadlines are t0 + k period, so lateness does not add up to drift. A period that has passed
-        completely is skipped and counted. ``before(k)`` is called before the scan at grid place k
-        (for a schedule of set points), ``observe`` after it.
-
-        Only KeyboardInterrupt, SystemExit and similar exceptions end the run, because the plant
-        needs an MV at every period. The effect of another exception depends on its source.
-
-        - ``endpoint``: a fault. The loop goes to HOLD and tries again.
-        - ``before``: a fault, because the set points may be wrong. The held MV is written.
-        - ``clock``: a fault, because the law's period is not known. The held MV is written, and the
-          machine's clock measures the next period.
-        - ``observe``, ``until``, ``stop``, the warm-up: no fault, because the MV is already written
-          or does not depend on them. The run continues; an ``until`` or ``stop`` that raises counts
-          as False. The report counts and names these exceptions, and the first of each is logged at once.
+        ``before(k)`` is called before the scan at grid place k (for a schedule of set points), ``observe`` after it.
+        ``loopwright.serving.scan_grid.run_on_grid`` says what happens where one of them, or the endpoint, raises.
 
         Raises
         ------

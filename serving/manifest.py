@@ -11,11 +11,12 @@ from typing import Any, Literal, Self, TypeAlias, get_args
 
 from loopwright.serving.errors import ArtifactError
 from loopwright.serving.fields import MAX_DIGITS, refused, shown
+from loopwright.serving.preview.ahead import AheadInput
 from loopwright.serving.words import ACTS
 
 MANIFEST_SCHEMA = 1  # of the manifest: a runtime refuses another
 MANIFEST_KEY = "loopwright.manifest"
-INPUTS = ("sp", "pv", "dv", "mv_applied", "state", "operate", "fresh")
+INPUTS = ("sp", "pv", "dv", "mv_applied", "state", "operate", "fresh", "ahead")
 MAX_CHARACTERS = 2**20  # of a manifest
 MAX_NAME = 200  # characters
 MAX_MANIFEST_DEPTH = 20  # of lists and objects in each other
@@ -111,11 +112,11 @@ class Signal:
 # ------------------------------------------------------------------------------- what operators change of a running law
 Group: TypeAlias = Literal["cv", "mv", "law"]
 What: TypeAlias = Literal[
-    "use", "track", "low", "high", "rank", "max_move", "rest", "rest_use", "cost", "speed", "caution"
+    "use", "track", "weight", "low", "high", "rank", "max_move", "rest", "rest_use", "cost", "speed", "caution"
 ]
 SWITCHES = frozenset({"use", "track", "rest_use"})
 OF_GROUP: Mapping[str, frozenset[str]] = {
-    "cv": frozenset({"use", "track", "low", "high", "rank", "cost"}),
+    "cv": frozenset({"use", "track", "weight", "low", "high", "rank", "cost"}),
     "mv": frozenset({"use", "low", "high", "max_move", "rest", "rest_use", "cost"}),
     "law": frozenset({"speed", "caution"}),
 }
@@ -127,10 +128,10 @@ class OperateEntry:
 
     ``group`` says of what it is one: a controlled variable (cv), an MV, or the whole law.
 
-    ``use`` 0 takes a signal out; ``track`` 0 leaves a controlled variable alone within ``low`` and ``high``; ``rank``
-    1 keeps its range before 2; ``max_move`` is a period's; ``rest`` is where an MV goes that nothing asks for, where
-    ``rest_use`` is 1; ``cost`` counts per unit of the signal and period, beside those of the other signals; ``speed``
-    and ``caution`` multiply those of the law.
+    ``use`` 0 takes a signal out; ``track`` 0 leaves a controlled variable alone within ``low`` and ``high``; ``weight``
+    multiplies that of its set point: the smaller one gives way; ``rank`` 1 keeps its range before 2; ``max_move`` is a
+    period's; ``rest`` is where an MV goes that nothing asks for, where ``rest_use`` is 1; ``cost`` counts per unit of
+    the signal and period, beside those of the other signals; ``speed`` and ``caution`` multiply those of the law.
     """
 
     group: Group
@@ -181,10 +182,11 @@ class OperateEntry:
 class Manifest:
     """The contract of one controller.
 
-    ``inputs`` names the graph's inputs, a subset of sp, pv, dv, mv_applied, state, operate, fresh: a graph has
+    ``inputs`` names the graph's inputs, a subset of sp, pv, dv, mv_applied, state, operate, fresh, ahead: a graph has
     only those that its law uses. ``info`` names the entries of the info vector.
     ``provenance`` says where the controller comes from, ``evidence`` how its validation went. ``operate`` are the
-    numbers that operators may change; ``fresh`` is 1 for each process variable with a new and good reading.
+    numbers that operators may change; ``fresh`` is 1 for each process variable with a new and good reading. ``ahead``
+    is what the law reads of the future.
     """
 
     case: str
@@ -201,6 +203,7 @@ class Manifest:
     provenance: dict[str, Any] = field(default_factory=dict)
     evidence: dict[str, Any] = field(default_factory=dict)
     operate: tuple[OperateEntry, ...] = ()
+    ahead: AheadInput | None = None
 
     def __post_init__(self) -> None:
         for name in ("sp", "pv", "dv", "mv"):
@@ -229,6 +232,10 @@ class Manifest:
             alone = [e.name for e in self.operate if e.what == one and f"{e.signal}.{other}" not in names]
             if alone:
                 raise ArtifactError(f"the manifest's operate has {alone[0]}, but no {other} end of that signal")
+        if ("ahead" in self.inputs) > (self.ahead is not None):
+            raise ArtifactError("the manifest's law reads ahead, but the manifest does not say what it is")
+        if self.ahead is not None:
+            self.ahead.require_fits(self.period_s, [s.name for s in self.sp], [s.name for s in self.dv])
         limited = [s.name for s in self.mv if s.most < math.inf]
         if limited and "mv_applied" not in self.inputs:
             raise ArtifactError(
@@ -243,6 +250,7 @@ class Manifest:
     def sizes(self) -> dict[str, int]:
         """Length of each input, whether the graph uses it or not."""
         others = {"state": self.n_state, "operate": len(self.operate), "fresh": len(self.pv)}
+        others["ahead"] = 0 if self.ahead is None else self.ahead.size
         return {n: others.get(n, len(self.signals(n))) for n in INPUTS}
 
     def usual(self, name: str) -> list[float]:
@@ -260,10 +268,12 @@ class Manifest:
             value = getattr(self, f.name)
             if f.name in {"sp", "pv", "dv", "mv"}:
                 value = [s.to_dict() for s in value]
+            if f.name in {"operate", "ahead"} and not value:  # a runtime of before reads files without them
+                continue
             if f.name == "operate":
-                if not value:  # a runtime of before reads files without it
-                    continue
                 value = [e.to_dict() for e in value]
+            if f.name == "ahead":
+                value = value.to_dict()
             row[f.name] = value
         return json.dumps(row, indent=indent, allow_nan=False)
 
@@ -279,7 +289,7 @@ class Manifest:
                 f"the manifest has schema {str(schema)[:MAX_NAME]}; this runtime reads schema {MANIFEST_SCHEMA}: "
                 "export the controller again or use the matching release of loopwright"
             )
-        missing = [f.name for f in fields(cls) if f.name not in row and f.name != "operate"]
+        missing = [f.name for f in fields(cls) if f.name not in row and f.name not in {"operate", "ahead"}]
         if missing:
             raise ArtifactError(f"the manifest lacks {', '.join(missing)}")
         unknown = sorted(set(row) - {f.name for f in fields(cls)})
@@ -300,6 +310,7 @@ class Manifest:
                 provenance=_dict(row["provenance"]),
                 evidence=_dict(row["evidence"]),
                 operate=tuple(OperateEntry.from_dict(_dict(e)) for e in _list(row.get("operate", []))),
+                ahead=AheadInput.from_dict(_dict(row["ahead"])) if "ahead" in row else None,
                 **signals,
             )
         except KeyError as error:

@@ -1,4 +1,4 @@
-"""The modes of a loop, how a fault changes them, the result of a scan, and the way of an MV to a law or an operator."""
+"""The modes of a loop, how a fault changes them, the result of a scan, and the way of an MV to a law."""
 
 from __future__ import annotations
 
@@ -150,7 +150,8 @@ class Command:
     plant's own controller, and then sets the mode to SHADOW.
 
     ``bridged`` and ``shed`` have the PVs whose readings were bad while the law went on, each with the reason: the law
-    predicts the first, and leaves the second alone (``loopwright.serving.bridging``).
+    predicts the first, and leaves the second alone (``loopwright.serving.bridging``). ``local`` has the MVs that the
+    plant has itself, each with the reason: their ``mv`` follows where they stand (``loopwright.serving.mvs``).
     """
 
     scan: int
@@ -164,6 +165,7 @@ class Command:
     hand_back: bool = False
     bridged: Mapping[str, str] = field(default_factory=dict)
     shed: Mapping[str, str] = field(default_factory=dict)
+    local: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def writes(self) -> bool:
@@ -201,28 +203,3 @@ class Transfer:
         ahead = applied + np.clip(move, -self._most, self._most)
         # A sum is rounded, and may leave the range by its last digit.
         return np.where(near, law, np.clip(ahead, np.minimum(law, applied), np.maximum(law, applied)))
-
-
-class ByHand:
-    """Where an operator sent the MV, and the way there: each by at most its ``max_move`` a period, as with any law.
-
-    It counts from the last command, which also a plant without a read-back has. Where nobody knows where the MV
-    stands, it is where the operator says.
-    """
-
-    def __init__(self) -> None:
-        self.wanted: Array | None = None  # shape: (n_mv,); None: it is there, or nobody moves it by hand
-
-    def sent(self, mv: Array, wanted: Array, signals: Sequence[Signal]) -> Array:
-        """Begin the way to ``wanted`` (n_mv,); the MV from now on, which is there already where none is limited."""
-        self.wanted = wanted if any(s.most < np.inf for s in signals) else None
-        return wanted if self.wanted is None else mv
-
-    def toward(self, mv: Array, signals: Sequence[Signal]) -> Array:
-        """The MV (n_mv,) one period nearer."""
-        if self.wanted is None:
-            return mv
-        ahead = np.array([s.toward(*ends) for s, *ends in zip(signals, mv.tolist(), self.wanted.tolist(), strict=True)])
-        if np.array_equal(ahead, self.wanted):
-            self.wanted = None
-        return ahead

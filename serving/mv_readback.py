@@ -41,6 +41,7 @@ class StandingMv:
         self._rested = 0
         # What is seen just before a loss may be somebody's move already: an offset counts once a command has followed.
         self._offset = self._seen = np.zeros(len(signals))
+        self.theirs = np.zeros(len(signals), dtype=bool)  # shape: (n_mv,), moved by others now: no offset shows
         self.lost = False  # whether the last command did not arrive, and no read-back has come since
 
     def commanded(self, mv: Array, *, written: bool) -> None:
@@ -57,15 +58,20 @@ class StandingMv:
             self._rested, self._seen = 0, self._offset
         self.mv = mv.copy()
 
+    def at(self, applied: Array) -> Array:
+        """Where MVs (n_mv,) stand that somebody else moves: the command that would keep them there."""
+        found = np.clip(applied - self._offset, self._low, self._high)
+        return np.where(np.abs(found - self.mv) <= self._same, self.mv, found)
+
     def seen(self, applied: Array) -> Array | None:
         """A read-back (n_mv,). Where the MVs stand after a loss, else None: HOLD then keeps what it has."""
         if not self.lost:
             if self._rested >= EQUAL_COMMANDS:
                 off = applied - self.mv
-                self._seen = np.where((self._least < np.abs(off)) & (np.abs(off) <= self._most), off, 0.0)
+                offset = np.where((self._least < np.abs(off)) & (np.abs(off) <= self._most), off, 0.0)
+                self._seen = np.where(self.theirs, self._offset, offset)
             return None
-        found = np.clip(applied - self._offset, self._low, self._high)
-        self.mv, self.lost = np.where(np.abs(found - self.mv) <= self._same, self.mv, found), False
+        self.mv, self.lost = self.at(applied), False
         self._rested, self._seen = 0, self._offset
         return self.mv
 
@@ -85,7 +91,13 @@ class ShownMV(NamedTuple):
 
 
 class AppliedMV:
-    """Reads the applied MV out of samples, and finds it again after commands that did not reach the plant."""
+    """Reads the applied MV out of samples, and finds it again after commands that did not reach the plant.
+
+    Such a command leaves it unknown where the MV stands: others may move it meanwhile. The next read-back tells, also
+    that of a sample which is refused for another reason, and nothing writes an old MV over it. Nothing is written while
+    the read-back is bad, nor, where the MV stands outside its range, until it is back. A plant that reads nothing back
+    gets the old MV.
+    """
 
     def __init__(self, signals: Sequence[Signal], mv: Array) -> None:
         self._signals = tuple(signals)
@@ -111,13 +123,17 @@ class AppliedMV:
         """A scan begins, and nothing was heard of a loss."""
         self._standing.commanded(self._given, written=self._written)
 
-    def look(self, sample: Sample, last: Array, *, refused: bool) -> ShownMV:
+    def look(self, sample: Sample, last: Array, *, refused: bool, theirs: NDArray[np.bool_] | None = None) -> ShownMV:
         """The MV by the sample; ``last`` is the last command (n_mv,), ``refused`` whether the sample is of no use.
+
+        ``theirs`` (n_mv,) are MVs that the plant has itself.
 
         A refused sample without a read-back tells nothing; a good one says that nothing is read back at all. Where it
         was not known where the MV stands, and it stands outside its range, somebody has moved it there. Nothing is
         written then, and none while the read-back is bad: what would be written is old.
         """
+        if theirs is not None:
+            self._standing.theirs = theirs
         try:
             applied = None if sample.mv_applied is None else self.read_back(sample, last)
         except Exception:  # no sample, or no MV that any actuator can have
@@ -155,6 +171,10 @@ class AppliedMV:
                 lows, highs, _ = zip(*self._ranges, strict=True)
                 return np.clip(applied, lows, highs)
         return applied
+
+    def at(self, applied: Array) -> Array:
+        """The command (n_mv,) that keeps each MV where it stands by its read-back, an actuator's offset apart."""
+        return self._standing.at(applied)
 
     def _unread(self, sample: Sample) -> ShownMV:
         """No sound read-back: after a loss nothing is written, unless the plant never reads anything back."""

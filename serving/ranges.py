@@ -26,7 +26,7 @@ def numbers(given: object) -> NDArray[Any]:
         raise TypeError(f"is no vector of numbers: {error}") from None
     if array.dtype.kind not in "fiu":
         raise TypeError(f"has the type {array.dtype}")
-    if array is not given and any(map(_is_truth, _entries(given))):
+    if array is not given and any(map(is_truth, _entries(given))):
         raise TypeError("has the type bool in part")
     return array
 
@@ -35,8 +35,17 @@ def _entries(given: Any) -> Any:
     return () if hasattr(given, "dtype") or isinstance(given, int | float) else given
 
 
-def _is_truth(value: object) -> bool:
+def is_truth(value: object) -> bool:
+    """Whether a single value is a truth value, of Python or of numpy."""
     return type(value) is bool or getattr(getattr(value, "dtype", None), "kind", "") == "b"
+
+
+def switched(given: object) -> object:
+    """``given`` with truth values as 1 and 0: they are the words of a switch."""
+    kind = getattr(getattr(given, "dtype", None), "kind", "")
+    if kind == "b":
+        return np.asarray(given, dtype=np.float64)
+    return [float(v) if is_truth(v) else v for v in given] if isinstance(given, list | tuple) else given
 
 
 def within(values: ArrayLike, signals: Sequence[Signal], what: str) -> Array:

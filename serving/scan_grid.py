@@ -69,7 +69,22 @@ def run_on_grid(
     observe: Callable[[Sample | None, Command], None] | None,
     stop: Callable[[], bool] | None = None,
 ) -> RunReport:
-    """See ``ControlLoop.run``."""
+    """``ControlLoop.run``: a scan at each place of a grid.
+
+    Deadlines are t0 + k period, so lateness does not add up to drift. A period that has passed completely is skipped
+    and counted.
+
+    Only KeyboardInterrupt, SystemExit and similar exceptions end the run, because the plant needs an MV at every
+    period. The effect of another exception depends on its source.
+
+    - ``endpoint``: a fault. The loop goes to HOLD and tries again.
+    - ``before``: a fault, because the set points may be wrong. The held MV is written.
+    - ``clock``: a fault, because the law's period is not known. The held MV is written, and the machine's clock
+      measures the next period.
+    - ``observe``, ``until``, ``stop``, the warm-up: no fault, because the MV is already written or does not depend on
+      them. The run continues; an ``until`` or ``stop`` that raises counts as False. The report counts and names these
+      exceptions, and the first of each is logged at once.
+    """
     period = loop.controller.manifest.period_s
     start = loop.clock.now()
     failures = Failures()

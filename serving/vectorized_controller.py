@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +12,9 @@ from numpy.typing import NDArray
 from loopwright.serving.controller import Array, Controller
 from loopwright.serving.errors import ContractError
 from loopwright.serving.operating import Operate
+from loopwright.serving.preview.differences import Differences
 
-STEERING = frozenset({"operate", "fresh"})  # inputs with defaults
+STEERING = frozenset({"operate", "fresh", "ahead"})  # inputs with defaults
 
 
 class VectorizedStep(NamedTuple):
@@ -36,7 +39,10 @@ class VectorizedController:
         self._mv, self._next = places.pop("mv"), places.pop("state_next")
         self._places = places
         self._given = np.zeros((n, controller.width))
-        self._operate = Operate(controller.manifest.operate)
+        m = controller.manifest
+        self._operate = Operate(m.operate)
+        if m.ahead is not None:
+            self._differences = Differences(m.ahead)
         usual = {name: np.array(controller.manifest.usual(name)) for name in STEERING}
         self._defaults: dict[str, Array] = {name: np.tile(values, (n, 1)) for name, values in usual.items()}
 
@@ -54,24 +60,31 @@ class VectorizedController:
         state: Array,
         operate: Array | None = None,
         fresh: Array | None = None,
+        ahead: Array | None = None,
     ) -> VectorizedStep:
         """One step of each row; all inputs (n, ...), in engineering units. An input that the law has not is ignored.
 
         ``operate`` (n, n_operate) as the manifest's ``operate`` lists it, None: its defaults; ``fresh`` (n, n_pv), 1
-        for a new and good reading, else 0, None: all are.
+        for a new and good reading, else 0, None: all are; ``ahead`` (n, N n_signals) as the manifest's ``ahead`` lists
+        it, None: nothing changes.
 
-        Raises ContractError for an input of another shape, and for a value of ``operate`` or ``fresh`` that is not
-        allowed, with its row. A row with an input that is not finite, or whose output is not finite, outside the MV's
+        Raises ContractError for an input of another shape, for a value of ``operate``, ``fresh`` or ``ahead`` that is
+        not allowed, with its row, and for an ``ahead`` that the law does not read.
+
+        A row with an input that is not finite, or whose output is not finite, outside the MV's
         range or further from ``mv_applied`` than the MV moves in a period, is marked as refused.
         """
         given = {"sp": sp, "pv": pv, "dv": dv, "mv_applied": mv_applied, "state": state}
         given |= {"operate": self._steering("operate", operate), "fresh": self._steering("fresh", fresh)}
+        given["ahead"] = self._steering("ahead", ahead)
+        if ahead is not None and "ahead" not in self._places:
+            raise ContractError(f"the law {self.controller.manifest.law!r} does not read ahead; leave ahead out")
         for name, place in self._places.items():
             wanted = (self.n, place.stop - place.start)
             if given[name].shape != wanted:
                 raise ContractError(f"{name} has the shape {given[name].shape}; {self.n} rows need {wanted}")
             if name in STEERING:
-                self._require_allowed(name, given[name])
+                self._require_allowed(name, given)
             self._given[:, place] = given[name]
         taken = self.controller.compute(self._given)
         mv = taken[:, self._mv].copy()
@@ -89,8 +102,9 @@ class VectorizedController:
         """``rows`` (n, ...), or the defaults in each."""
         return self._defaults[name] if rows is None else np.asarray(rows, dtype=np.float64)
 
-    def _require_allowed(self, name: str, rows: Array) -> None:
+    def _require_allowed(self, name: str, given: Mapping[str, Array]) -> None:
         """ContractError, with its number, for the first row (n, ...) that ``Controller.step`` would not take."""
+        rows = given[name]
         if rows is self._defaults[name]:
             return
         if name == "fresh":
@@ -99,8 +113,19 @@ class VectorizedController:
                 k = int(np.argmin(good))
                 raise ContractError(f"row {k}: fresh is {rows[k].tolist()}; each is 1 for a new and good reading, or 0")
             return
+        if name == "ahead":
+            present = np.concatenate([given["sp"], given["dv"]], axis=1)
+            bad = ~self._differences.allowed(rows, present).all(axis=1)
+            for k in np.flatnonzero(bad).tolist():
+                self._refused(k, partial(self._differences.checked, rows[k], present[k]))
+            return
         for k in np.unique(rows, axis=0, return_index=True)[1].tolist():  # most rows have the same values
-            try:
-                self._operate.checked(rows[k])
-            except ContractError as error:
-                raise ContractError(f"row {k}: {error}") from error
+            self._refused(k, partial(self._operate.checked, rows[k]))
+
+    @staticmethod
+    def _refused(k: int, check: Callable[[], object]) -> None:
+        """ContractError with the row k where ``check`` raises one."""
+        try:
+            check()
+        except ContractError as error:
+            raise ContractError(f"row {k}: {error}") from error

@@ -137,6 +137,19 @@ def answers_refusals_and_disturbances(run: Run, file: Path, answers: Path) -> No
     assert verdict.identical, verdict.text()
 
 
+def takes_what_is_to_come(run: Run, file: Path, answers: Path) -> None:
+    """No shipped law reads ``ahead``; the one in ``file`` does (tests/course_files.py)."""
+    vectors = json.loads((kit_of(file) / VECTORS).read_text())
+    given = [tuple(row["given"]["ahead"]) for row in vectors["steps"]]
+    assert len(set(given)) > 100
+    assert (0.0).hex() in {value for row in given for value in row if len(set(row)) == 1}  # nothing to come
+    done = run("--conformance", kit_of(file), answers)
+    assert done.returncode == 0, done.stdout + done.stderr
+    verdict = verdict_on(file, answers)
+    assert verdict.identical, verdict.text()
+    assert run(kit_of(file) / file.name, "3", "0.02").returncode == 0  # and without any
+
+
 def takes_what_operators_change(run: Run, file: Path, answers: Path) -> None:
     """No shipped law reads ``operate`` and ``fresh``; the one in ``file`` does (tests/operated_laws.py)."""
     vectors = json.loads((kit_of(file) / VECTORS).read_text())

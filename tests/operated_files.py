@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from identified_models import random_model
+from identified_models import made_signals, random_model
 from operated_law import ENTRIES, NARROW_ENTRIES, OTHER_ENTRIES, PLANT, OperatedLaw
 from predictive_loops import law_of
 from torch import Tensor
 
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.laws import ControlLaw
+from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.serving import Controller
 
 
@@ -62,3 +64,12 @@ def predictive_model() -> Any:
 def predictive(predictive_model: Any, tmp_path_factory: pytest.TempPathFactory) -> Controller:
     """The predictive law of ``predictive_model`` that reads both."""
     return _exported(law_of(predictive_model, horizon=15, operate={}), tmp_path_factory.mktemp("predictive"))
+
+
+@pytest.fixture(scope="session")
+def slow_mvs(predictive_model: Any, tmp_path_factory: pytest.TempPathFactory) -> Controller:
+    """The same law, whose MVs move by at most .1 V a period."""
+    signals = made_signals(predictive_model.n_y, predictive_model.n_mv)
+    limited = replace(signals, mv=tuple(replace(s, max_move=0.1) for s in signals.mv))
+    law = Predictive(limited, predictive_model, Predictive.Params(horizon=15, operate={}))
+    return _exported(law, tmp_path_factory.mktemp("slow"))

@@ -19,23 +19,33 @@ def entries_of(
     plant: Mapping[str, Any],
     export: ExportParams | None = None,
     old: Sequence[OldController] = (),
+    operate: Mapping[str, float] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """The entries of params.yaml for an own plant: its section, its tests, its models, and its controllers.
 
-    These are two of ours, and with believed ``old`` ones of all controlled variables the loop that they make up. With
-    ``export`` its files too, of which stage `screen` makes the record; without, ``plant`` says where that is.
+    These are two of ours, or predictive control alone where a controlled variable is an analyser, and with believed
+    ``old`` ones of all controlled variables the loop that they make up. With ``export`` its files too, of which stage
+    `screen` makes the record; without, ``plant`` says where that is. With the defaults of ``operate``, which may be
+    none, operators change the predictive law while it runs, and its model has all process variables as outputs.
     """
     from loopwright.pipeline.models.identified.structure_search import (
         MINUTES,  # here, because torch takes seconds to load
     )
 
     # The default, written out: all members share one search, so that they must have the same number.
-    minutes = {"minutes": MINUTES * min(len(plant["pv"]), len(plant["mv"]))}
-    members = {f"plant{k}": {"kind": LAW_PART, "member": k, **minutes} for k in MEMBER_NUMBERS}
-    parts = {LAW_PART: {"kind": LAW_PART, **minutes}, **members}
+    n_cv = plant.get("controlled") or min(len(plant["pv"]), len(plant["mv"]))
+    ranged = operate is not None and n_cv < len(plant["pv"])
+    minutes = {"minutes": MINUTES * (len(plant["pv"]) if ranged else n_cv)}
+    search = {"kind": LAW_PART, **({"outputs": "measured"} if ranged else {})}
+    members = {f"plant{k}": {**search, "member": k, **minutes} for k in MEMBER_NUMBERS}
+    parts = {LAW_PART: {**search, **minutes}, **members}
+    steered = {} if operate is None else {"operate": dict(operate)}
     own = {"case": name, "model": MODEL_SET}
     data = screened_record(name).as_posix() if export else plant["data"]
     loops = loops_of(plant, old)
+    # A PID winds up on a number that stands: none is built for an analyser.
+    seldom = any(s.get("every", 1) > 1 for s in plant["pv"][:n_cv])
+    pid = {} if seldom else {f"{name}-pid": {**own, "name": "pid", "law": "pid", **_pairs(loops)}}
     believed = bool(loops) and all(law.believed for law in loops)
     before = {f"{name}-{OLD_LOOP}": {**own, "name": OLD_LOOP, **_as_pid(loops), **_pairs(loops)}} if believed else {}
     return {
@@ -44,8 +54,8 @@ def entries_of(
         "cases": {name: {"held_out_seeds": [9001, 9002, 9003], "noise_seed": 1}},
         "models": {f"{name}-{MODEL_SET}": {**own, "data": data, "parts": parts}},
         "controllers": {
-            f"{name}-predictive": {**own, "name": "predictive", "law": "predictive", "tuning": "search"},
-            f"{name}-pid": {**own, "name": "pid", "law": "pid", **_pairs(loops)},
+            f"{name}-predictive": {**own, "name": "predictive", "law": "predictive", "tuning": "search", **steered},
+            **pid,
             **before,
         },
     }

@@ -328,6 +328,7 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         "data": params.data,
         "known": together(params.known),
         "held": _held(name, params),
+        "read_every": tuple(s.every for s in params.pv) if any(s.every > 1 for s in params.pv) else (),
         "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
         "__module__": base.__module__,
         **({"gate": GATE_WITH_MEASURED} if dv else {}),

@@ -28,10 +28,12 @@ from loopwright.pipeline.commands.own_plant.knowledge import (
     check_start,
     commanded,
     confirmed,
-    mvs_of,
     signals_as_tags,
+    signals_of_simulator,
     stated_of,
 )
+from loopwright.pipeline.commands.own_plant.number_options import NUMBER_OPTIONS, limited, numbers_given
+from loopwright.pipeline.commands.own_plant.operator_ranges import OperatorDefaults
 from loopwright.pipeline.commands.own_plant.replaced import (
     REFUSED,
     check_replaceable,
@@ -45,8 +47,9 @@ from loopwright.pipeline.config.params import add_entries, sections
 from loopwright.pipeline.config.plants import check_name
 from loopwright.pipeline.errors import PipelineError, RecordError
 from loopwright.pipeline.files import draft_folder_of, write_json, write_text
+from loopwright.pipeline.historian.cleaning.new_readings import rows_between
 from loopwright.pipeline.historian.cleaning.record_rows import evenly
-from loopwright.pipeline.historian.cleaning.tags import RANGES, ROLES, TableError, Tag, limited, named
+from loopwright.pipeline.historian.cleaning.tags import RANGES, ROLES, TableError, Tag, named
 from loopwright.pipeline.historian.export_params import read_and_screen, with_units
 from loopwright.pipeline.historian.guessing import controlled_first
 from loopwright.pipeline.historian.screening import Refusal, Screened, refusal
@@ -59,7 +62,10 @@ from loopwright.pipeline.stages.paths import DATA, WORK
 from loopwright.serving.words import plain
 
 LEAST_EXPERIMENT, MOST_EXPERIMENT = 500, 200_000  # of the experiment on a simulator
-WORDS = {"pv": "process variable, controlled ones first", "mv": "manipulated variable", "dv": "measured disturbance",
+WORDS = {"pv": "process variable, controlled ones first",
+         "constraint": "process variable without a set point, which is kept in its range",
+         "analyser": "process variable with a new reading now and then, late by what its analysis takes",
+         "constraint-analyser": "both of these", "mv": "manipulated variable", "dv": "measured disturbance",
          "sp": "set point", "mode": "mode of a loop (auto, manual)"}  # fmt: skip
 
 
@@ -76,10 +82,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     for role in ROLES:
         form = "TAG" if role in {"sp", "mode"} else "TAG[UNIT][=LOW..HIGH]"
         add(f"--{role}", metavar=form, action="append", default=[], help=f"{WORDS[role]}; may be given again")
-    add("--command", metavar="TAG=LOW..HIGH", action="append", default=[],
-        help="range that the controller may command an MV over, within the range of its readings")  # fmt: skip
-    add("--max-move", metavar="TAG=CHANGE", action="append", default=[],
-        help="largest change of an MV in a minute that the controller may make, in the MV's unit")  # fmt: skip
+    for option, of in NUMBER_OPTIONS.items():
+        add(f"--{option}", metavar=f"TAG={of.form}", action="append", default=[], help=of.help)
     add("--known", metavar="PV/INPUT=WORDS", action="append", default=[],
         help="what you know of the answer to an MV or DV: +, -, none, gain LOW..HIGH, dead FROM..TO (s)")  # fmt: skip
     add("--tags", metavar="FILE", type=Path, help="the corrected table of roles, instead of these options")
@@ -121,8 +125,10 @@ def _run(options: argparse.Namespace) -> int:
     if not options.files:
         raise RecordError("no file is named; give one or more exports, or --simulator FILE")
     given, _ = given_tags(options)
-    if not given and (options.command or options.max_move or options.known):
-        raise RecordError("--command, --max-move or --known is given and no mv is; name it with --mv, or give --tags")
+    numbers = numbers_given(options)
+    if not given and (any(numbers.values()) or options.known):
+        several = ", ".join(f"--{option}" for option in numbers)
+        raise RecordError(f"{several} or --known is given and no mv is; name it with --mv, or give --tags")
     if not given:
         propose_tags(name, options)
         return 0
@@ -140,7 +146,7 @@ def _run(options: argparse.Namespace) -> int:
 def _check_files(name: str, options: argparse.Namespace) -> None:
     """RecordError for a file that is not there: it may be the second word of an option that takes one."""
     absent = next((path for path in options.files if not path.exists()), None)
-    if absent is not None and not absent.suffix and any(getattr(options, role) for role in ROLES):
+    if absent is not None and not absent.suffix and any(getattr(options, role.replace("-", "_")) for role in ROLES):
         raise RecordError(
             f"{absent}: no such file; NAME is {name!r}: --pv and its like take one TAG, give them again for another"
         )
@@ -157,7 +163,7 @@ def _simulated(name: str, folder: Path, options: argparse.Namespace) -> int:
         if table is None:
             return _proposed(name, path)
     plant = FileSimulator(path, name, table=table)
-    commands = named(tags) or limited(mvs_of(plant), options.command, options.max_move)
+    commands = named(tags) or limited(signals_of_simulator(plant), numbers_given(options))
     check_start(plant, commands)  # before the minutes of an experiment
     stated_of(signals_as_tags(plant, commands), options.known)
     made = simulated(plant, options.rows, options.period)
@@ -189,6 +195,7 @@ def _write(
     The record of ``export`` is left to stage `screen`; that of the experiment on a simulator is written here.
     """
     report, verdict, limits = found.report, found.report.verdict, list[str]()
+    operated = OperatorDefaults.of(found.record, tags)
     if options.replace:
         tags, limits = limits_kept(name, tags)
     check_commands(found.record.mv_signals, tags)
@@ -211,6 +218,7 @@ def _write(
         if made and not unusable:
             found.record.write(draft / "record.parquet")
         plant = signals_of(found.record, tags)
+        plant |= {} if operated.controlled is None else {"controlled": operated.controlled}
         plant |= {"known": [one.to_dict() for one in known]} if known else {}
         found.record = evenly(found.record)  # pages need no more, and a long record is large
         write_json(draft / "screening.json", report.to_dict())
@@ -226,7 +234,7 @@ def _write(
             record, simulator = folder / "record.parquet", folder / copy_name(made.plant.path)
             plant |= {"data": record.as_posix(), "source": [dict(f) for f in report.files]}
             plant |= {"simulator": simulator.as_posix()}
-        entries = entries_of(name, plant, export, report.old_controllers)
+        entries = entries_of(name, plant, export, report.old_controllers, operated.defaults)
         try:
             lost = wishes_lost(name, entries, earlier / "screening.json")
             add_entries(entries, replace=options.replace, remove=[("exports", name)] if options.replace else ())
@@ -247,8 +255,8 @@ def _write(
             print(plain(f"{line}; is it so? Column loop of the table of tags corrects it"))
     for line in confirmed(found.record.mv_signals, tags, {old.mv for old in report.old_controllers}):
         print(line)
-    for line in known_lines(beside):
-        print(line)
+    for line in (*operated.lines, *known_lines(beside)):
+        print(plain(line))
     if questions:
         print("no controller is shipped before that is answered: change the statement, or the tags")
     for limit in (*limits, *more):
@@ -282,8 +290,10 @@ def _words(refused: Refusal) -> str:
 def signals_of(record: Record, tags: Sequence[Tag] = ()) -> dict[str, Any]:
     """Period and signals as ``plants.<name>`` of params.yaml holds them; ``tags`` say what may be commanded."""
     groups = {"pv": record.pv_signals, "mv": record.mv_signals, "dv": record.dv_signals}
-    commands = {t.name: t.commands for t in tags}
+    own: dict[str, dict[str, Any]] = {t.name: dict(t.commands) for t in tags}
+    for i, fresh in record.seldom.items():
+        own.setdefault(record.pv_signals[i].name, {})["every"] = rows_between(fresh)
     return {
         "period_s": record.period_s,
-        **{role: [s.to_dict() | commands.get(s.name, {}) for s in signals] for role, signals in groups.items()},
+        **{role: [s.to_dict() | own.get(s.name, {}) for s in signals] for role, signals in groups.items()},
     }

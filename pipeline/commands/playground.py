@@ -17,6 +17,7 @@ from loopwright.pipeline.playground.about import about, validation_of
 from loopwright.pipeline.playground.site import HOST, Playground, file_server, write_folder, write_one_file
 from loopwright.pipeline.playground.web_runtime import web_runtime
 from loopwright.serving.controller import Controller
+from loopwright.serving.controller_file import controller_files
 
 PORT = 8123  # of the page, where none is given
 ALL = "all"
@@ -60,7 +61,7 @@ def run(options: argparse.Namespace) -> None:
 def page_of(case: Case, artifacts: Path) -> Playground:
     """The page of a case with all of its controllers; ParamsError where it has none."""
     folder = artifacts / case.name
-    controllers = [Controller(path) for path in sorted(folder.glob("*.onnx"))]
+    controllers = [Controller(path) for path in controller_files(folder)]
     if not controllers:
         raise ParamsError(f"{folder} has no controller; make some with `loopwright run {case.name}`")
     for controller in controllers:
@@ -71,7 +72,7 @@ def page_of(case: Case, artifacts: Path) -> Playground:
 def _cases(names: list[str], artifacts: Path) -> list[Case]:
     cases = all_cases()
     if names == [ALL]:
-        found = [case for name, case in cases.items() if any((artifacts / name).glob("*.onnx"))]
+        found = [case for name, case in cases.items() if controller_files(artifacts / name)]
         if not found:
             raise ParamsError(f"{artifacts} has no controller; make some with `loopwright run`")
         return found

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import ParamSpec, TypeVar
@@ -13,15 +14,18 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from loopwright.pipeline.cases import PLANTS, all_cases
+from loopwright.pipeline.cases.operated_tests import operated_tests
 from loopwright.pipeline.commands.arguments import positive, real, require_made_for, require_shipped, whole
-from loopwright.pipeline.config.params import choose
+from loopwright.pipeline.config.params import CaseParams, choose, parse, read_section
 from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.metric import METRICS
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
 from loopwright.pipeline.pictures.loop_picture import History, draw, summary, write_csv
+from loopwright.pipeline.pictures.operated_summary import operated_lines
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.live import SimulatedPlant, view_of
+from loopwright.pipeline.simulation.operator_changes import OperatedCourse
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.timetable import Timetable, parse_event, parse_manual, timetable
 from loopwright.serving.clock import MonotonicClock, VirtualClock
@@ -30,6 +34,8 @@ from loopwright.serving.endpoint import Array
 from loopwright.serving.guard import Sample
 from loopwright.serving.loop import WARM_LEAD_S, Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest
+from loopwright.serving.preview.course import Courses, Points
+from loopwright.serving.preview.course_file import read_courses
 
 LIVE_RECOVERY = 5  # good samples
 P = ParamSpec("P")
@@ -46,7 +52,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
     events("--sp", "[NAME=]VALUE[@S]", "set point from time S on; of several set points with its name")
-    add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one)")
+    add("--scenario", metavar="NAME", help="a test of the case (default, without --sp: its first one), or of operators")
     add("--from", metavar="CV", type=real("a finite number"), dest="start",
         help="start at the steady state of this CV")  # fmt: skip
     events("--disturbance", "NAME=VALUE[@S]", "measured disturbance or plant parameter from time S on")
@@ -55,7 +61,11 @@ def options(parser: argparse.ArgumentParser) -> None:
         "PV=STD",
         "standard deviation of a reading's noise, of a measured disturbance too, over the whole run",
     )
-    events("--operate", "NAME=VALUE", "of what operators may change, another value than the file's default")
+    events("--operate", "NAME=VALUE[@S]", "what operators change of the file's defaults, from time S on")
+    add("--course", metavar="FILE.csv", type=Path,
+        help="set points and measured disturbances by time from the start, which the law knows before")  # fmt: skip
+    add("--straight", metavar="NAME", action="append", default=[],
+        help="a set point of the course that runs straight to each value")  # fmt: skip
     add("--manual", metavar="S..S[=MV,..]", type=partial(_argument, parse_manual), action="append", default=[],
         help="MANUAL between two times, with one value an MV")  # fmt: skip
     add("--duration", metavar="S", type=positive("s"), help="length of the run")
@@ -65,11 +75,17 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--csv", metavar="FILE", type=Path, help="write every sample there")
 
 
-def _test_of(case: Case | None, name: str | None) -> Scenario | None:
-    """The first sequence of the case's test ``name``, or of its first test; None where the plant has no case."""
+def _test_of(case: Case | None, name: str | None, manifest: Manifest) -> Scenario | None:
+    """The first sequence of the case's test ``name``, or of its first test; None where the plant has no case.
+
+    A test in which operators change what this file may be asked for has a name, too.
+    """
     if case is None:
         return None
     tests = case.tests()
+    if name is not None and name not in tests and manifest.operate:
+        own = parse(CaseParams, read_section("cases", case.name), f"cases.{case.name}").operated
+        tests |= {key: test.sequences for key, test in operated_tests(case, manifest.operate, own).items()}
     return choose(tests, next(iter(tests)) if name is None else name, "scenario", f"case {case.name!r}")[0]
 
 
@@ -82,11 +98,12 @@ def run(options: argparse.Namespace) -> None:
     plant, case = _plant_of(controller.manifest)
     course = timetable(
         plant,
-        None if options.sp else _test_of(case, options.scenario),
+        None if options.sp else _test_of(case, options.scenario, controller.manifest),
         set_points=options.sp,
         disturbances=options.disturbance,
         noise=options.noise,
         manual=options.manual,
+        operate=options.operate,
         start_cv=options.start,
         duration_s=options.duration,
         seed=options.seed,
@@ -99,9 +116,17 @@ def run(options: argparse.Namespace) -> None:
             f"--scenario {others}"
         )
     title = f"{controller.manifest.law} on {plant.title}"
-    operate = {event.name: event.value for event in options.operate}
-    history = close_loop(controller, plant, course, title=title, speed=options.speed, operate=operate)
+    known = None
+    if options.course is not None:
+        known = KnownCourses(read_courses(options.course, time.time()), tuple(options.straight))
+        course = known.happening(controller.manifest, course, {event.name for event in options.disturbance})
+    elif options.straight:
+        raise ParamsError("--straight says how a set point of a course runs; give the course by --course FILE.csv")
+    history = close_loop(controller, plant, course, title=title, speed=options.speed, known=known)
     print(summary(plant, history, METRICS["mae"] if case is None else case.criterion))
+    noise = np.zeros(len(plant.pv_signals)) if case is None else case.noise_std
+    for line in operated_lines(plant, history, noise):
+        print(line)
     picture = options.picture or Path(f"{controller.manifest.law}-simulation.png")
     draw(picture, plant, history, title, course.marks)
     print(f"picture: {picture}")
@@ -117,13 +142,18 @@ def close_loop(
     *,
     title: str,
     speed: float | None = None,
-    operate: Mapping[str, float] | None = None,
+    known: KnownCourses | None = None,
 ) -> History:
     """Run the controller's ControlLoop over the plant and show it; ``speed`` None is as fast as possible.
 
-    ``operate`` are values that operators have changed, by name; LoopError for a wrong one.
+    ``known`` is what is known of the future; a set point with a course follows it, and not the timetable. ParamsError
+    where the course changes what operators may not change of this file; LoopError where it has nothing that they may
+    change, and for a wrong value of what is known.
     """
-    simulated, history = SimulatedPlant(plant, course), History()
+    simulated, history = SimulatedPlant(plant, course), History(mv0=course.mv0, entries=controller.manifest.operate)
+    operated = {change.at: change.values for change in course.operate}
+    if controller.manifest.operate and operated:
+        OperatedCourse.of(controller.manifest.operate, course.operate, len(course.sp), "this run")
     # The loop outlives whatever raises, as a plant needs it to; a simulation that raised is over.
     failed: list[Exception] = []
 
@@ -148,8 +178,13 @@ def close_loop(
         recover_after=LIVE_RECOVERY,
         clock=VirtualClock() if speed is None else MonotonicClock(speed),
         warm_lead_s=0.0 if speed is None else WARM_LEAD_S * speed,
-        operate=operate,
+        operate=operated.pop(0, None),
     )
+    if known is not None:
+        loop.set_course(known.points, known.straight)
+    followed = np.array([known is not None and s.name in known.points for s in controller.manifest.sp])
+    if operated and not controller.manifest.operate:
+        loop.set_operate(next(iter(operated.values())))  # raises, before anything has run
     period, n = plant.period_s, len(course.sp)
     marks = {round(at / period): text for at, text in course.marks.items()}
 
@@ -157,7 +192,9 @@ def close_loop(
         # A period that a slow machine missed passed in the plant too, with the MV held.
         while simulated.k < k:
             simulated.write(simulated.mv)
-        loop.set_sp(course.sp[k])
+        loop.set_sp(np.where(followed, loop.sp, course.sp[k]))
+        if k in operated:
+            loop.set_operate(operated[k])
         span = course.manual_at(k * period)
         if span is not None and loop.mode is not Mode.MANUAL:
             loop.set_mode(Mode.MANUAL)
@@ -175,6 +212,8 @@ def close_loop(
         history.sp.append(command.sp)
         history.measured.append(sample.pv)
         history.mv.append(command.mv)
+        if history.entries:
+            history.operate.append(loop.operate)
         history.reason.append(command.fault)
         values = np.concatenate([command.sp, sample.pv, command.mv])
         show(k * period, command.mode.value, values, command.fault, marks.get(k))
@@ -184,6 +223,29 @@ def close_loop(
     if failed:
         raise failed[0]
     return history
+
+
+@dataclass(frozen=True, slots=True)
+class KnownCourses:
+    """Courses by signal, times from the run's start, and the names of set points that run straight."""
+
+    points: Mapping[str, Points]
+    straight: tuple[str, ...] = ()
+
+    def happening(self, manifest: Manifest, run: Timetable, others: Collection[str] = ()) -> Timetable:
+        """The run in which measured disturbances become what is forecast, but for the ``others``.
+
+        LoopError for a course that cannot be.
+        """
+        given = {course.signal: course for course in Courses(manifest).checked(self.points, self.straight)}
+        n = len(run.sp)
+        nominal = run.plant.dv_nominal
+        dv = np.tile(nominal, (n, 1)) if run.dv is None else run.dv.copy()
+        for i, s in enumerate(manifest.dv):
+            if s.name in given and s.name not in others:
+                times: Array = run.plant.period_s * np.arange(n, dtype=np.float64)
+                dv[:, i] = given[s.name].begun(0.0, float(dv[0, i])).at(times, float(dv[0, i]))
+        return replace(run, dv=dv)
 
 
 @dataclass(frozen=True)

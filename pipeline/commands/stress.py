@@ -24,7 +24,7 @@ from loopwright.pipeline.pictures.drawing import save
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.stress_pictures import loop_canvas
 from loopwright.pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
-from loopwright.pipeline.simulation.timetable import TimedValue, parse_event
+from loopwright.pipeline.simulation.timetable import TimedValue, at_once, parse_event
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.operating import Operate
 
@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> None:
     manifest, content = opened(options.file)
     case = _case_of(manifest)
     drawing = Drawing(case, options.seed, options.spread / 100, options.faults / 100)
-    operate = {event.name: event.value for event in options.operate}
+    operate = at_once(options.operate)
     Operate(manifest.operate).with_values(operate)  # an error comes before any work
     stress = Stress(drawing, content, tuple(operate.items()))
     for tests in drawing.tests.values():

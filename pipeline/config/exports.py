@@ -73,7 +73,7 @@ class ExportedTag:
     """
 
     tag: str
-    role: Literal["pv", "mv", "dv", "sp", "mode"]
+    role: Literal["pv", "constraint", "analyser", "constraint-analyser", "mv", "dv", "sp", "mode"]
     unit: str = ""
     low: float | None = None
     high: float | None = None

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import yaml
 
+from loopwright.pipeline.config.operator_tests import OperatedTestParams, check_names
 from loopwright.pipeline.config.reading import tree_of
 from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.files import write_bytes
@@ -96,10 +97,17 @@ def parse(cls: type[T], values: Mapping[str, Any], where: str) -> T:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CaseParams:
-    """``cases.<case>``: what validation and report need beyond the case's own text."""
+    """``cases.<case>``: what validation and report need beyond the case's own text.
+
+    ``operated`` are further tests of laws with ``operate``, by name.
+    """
 
     held_out_seeds: tuple[int, ...]
     noise_seed: int = 0
+    operated: Mapping[str, OperatedTestParams] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_names(tuple(self.operated))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -20,16 +20,22 @@ NAME = re.compile(r"^[a-z][a-z0-9_]{0,63}$")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SignalParams:
-    """One signal: its name, unit, and the range in which it is meaningful."""
+    """One signal: its name, unit, and the range in which it is meaningful.
+
+    ``every``: rows from one new reading of an analyser to the next; 1: it is read in each row.
+    """
 
     name: str
     unit: str
     low: float
     high: float
+    every: int = 1
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
             raise ValueError(f"{self.name} has the range {self.low:g} to {self.high:g}; low must be below high")
+        if self.every < 1:
+            raise ValueError(f"{self.name}: every is {self.every}; give the rows between two readings, 1 or more")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -180,6 +186,9 @@ class PlantParams:
         twice = [n for n in names if names.count(n) > 1]
         if twice:
             raise ValueError(f"signal {twice[0]!r} is there twice; give each its own name")
+        for s in self.dv:
+            if s.every != 1:
+                raise ValueError(f"{s.name}: every is {s.every}; a measured disturbance is read in each row, give 1")
         if wrong := mistake_of_known(
             self.known,
             [s.name for s in self.pv],

@@ -137,6 +137,7 @@ class Case(ABC):
     recipe: ClassVar[bool] = False  # the set-point profile is known in advance; the bounds may use it
     unforeseen: ClassVar[bool] = False  # the bounds' NMPC sees a parameter change one sample late
     disclosure: ClassVar[str] = ""  # for the report: the scored figures that influenced settings
+    read_every: ClassVar[tuple[int, ...]] = ()  # samples from one new reading of each PV to the next; (): all are read
     baseline: ClassVar[str] = "pid"  # the law that a champion must beat, and that reports compare with
     old_loop: ClassVar[str] = ""  # the law that the plant was run by before: none is best that does not beat it
     data_seeds: ClassVar[int] = 5  # required of the best law; 1 if no model is trained on data

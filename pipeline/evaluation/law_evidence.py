@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.pipeline.evaluation.operated import OperatedResult
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 from loopwright.pipeline.files import write_text
 from loopwright.pipeline.simulation import NOISE_SUFFIX
@@ -121,7 +122,8 @@ class LawMetrics:
     name, and what to do; ``beyond_reach``: as ``locked_up``, holds that count as no lock-up, because no control gets to
     their set point; ``calmed``: why the law's own numbers are not shipped, a clause after
     its name, where calmer ones hold; all figures are then of these; ``cold_start``: what the files ask for at rests of
-    the record, of a case on models.
+    the record, of a case on models; ``operated``: test -> what came of it, of a law with ``operate``, by its shipped
+    file.
     """
 
     name: str
@@ -146,6 +148,7 @@ class LawMetrics:
     beyond_reach: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     calmed: str = ""
     cold_start: ColdStart | None = None
+    operated: Mapping[str, OperatedResult] = field(default_factory=dict)
 
     @property
     def why_withheld(self) -> str:
@@ -261,6 +264,10 @@ class LawEvidence:
     def cycling(self) -> Loop:
         """Arrays of the loop with the worst limit cycle by name, see ``worst_cycle``; empty where there is none."""
         return arrays(self.trajectories, "cycling/")
+
+    def operated(self, test: str) -> Loop:
+        """Arrays of the loop of a test in which operators change something by name; empty where it did not run."""
+        return arrays(self.trajectories.with_name("operated.npz"), f"{test}/")
 
     def replay(self) -> Loop:
         """Arrays of the replay over the plant's record by name; empty where there was none."""

@@ -12,6 +12,7 @@ from typing import Self
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.law_evidence import lock_up_text
 from loopwright.pipeline.evaluation.metric import TRAVEL, gate_ratio, ratio_to_bound
+from loopwright.pipeline.evaluation.operated import words_of
 from loopwright.pipeline.evaluation.validation import FILE, CheckedStatement, Validation
 from loopwright.pipeline.files import read_json
 from loopwright.pipeline.simulation import NOISE_SUFFIX
@@ -34,6 +35,7 @@ class LawStanding:
     bytes: int | None  # size of the controller file
     travel: float | None = None  # of the MVs on ``CaseStanding.travel_test``
     swings: str = ""  # the tests in which a closed loop swings to the end
+    operated: str = ""  # the worst of its tests in which operators change more than set points
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,4 +190,5 @@ def _law(validation: Validation, law: str, folder: Path) -> LawStanding:
         if validation.travel_words
         else None,
         swings=lock_up_text(result.swings),
+        operated=words_of(result.operated),
     )

@@ -8,6 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 from typing import Final, Literal
 
@@ -23,7 +24,13 @@ from loopwright.pipeline.evaluation.metric import DRAW_SEEDS, TRAVEL, mean_of_dr
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
-from loopwright.pipeline.simulation.simulate import DV_DRAW, Trajectory, noise_of_disturbances, simulate_closed
+from loopwright.pipeline.simulation.simulate import (
+    DV_DRAW,
+    Trajectory,
+    noise_of_disturbances,
+    read_now,
+    simulate_closed,
+)
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopwrightError
 from loopwright.serving.manifest import Signal
@@ -129,7 +136,9 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     """One test; with noise it runs ``noise_draws`` times."""
     draws = range(case.noise_draws if noise else 1)
     loops = [
-        close_loop(controller, case.plant, test, case.noise_std if noise else None, seed + DRAW_SEEDS * i)
+        close_loop(
+            controller, case.plant, test, case.noise_std if noise else None, seed + DRAW_SEEDS * i, case.read_every
+        )
         for i in draws
     ]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
@@ -146,8 +155,17 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
     )
 
 
-def close_loop(controller: Controller, plant: Simulator, test: Scenario, noise: Array | None, seed: int) -> Trajectory:
+def close_loop(
+    controller: Controller,
+    plant: Simulator,
+    test: Scenario,
+    noise: Array | None,
+    seed: int,
+    every: Sequence[int] = (),
+) -> Trajectory:
     """One closed loop over the test's plant, or over ``plant`` where it has none.
+
+    With ``every``, see ``simulate_closed``, some PVs are read now and then; a law that reads ``fresh`` is told when.
 
     An extra entry of info is 1 if the controller refused the step. The MV then stays at its last value, as in the real
     loop's HOLD. With noise, measured disturbances have theirs.
@@ -156,20 +174,24 @@ def close_loop(controller: Controller, plant: Simulator, test: Scenario, noise: 
     disturbances = test.disturbances(plant)
     if noise is not None:
         disturbances = disturbances + noise_of_disturbances(plant, test.samples, np.random.default_rng([seed, DV_DRAW]))
-    measured = iter(disturbances)
-    n_info = len(controller.manifest.info)
+    measured, n_info, samples = iter(disturbances), len(controller.manifest.info), count()
+    operated = test.operated(controller.manifest.operate)
+    asked = None if operated is None else iter(operated.values)
+    told = bool(every) and "fresh" in controller.manifest.inputs
 
     def step(sp: Array, pv: Array, mv_applied: Array) -> tuple[Array, tuple[float, ...]]:
         nonlocal state
-        dv = next(measured)
+        steered = {} if asked is None else {"operate": next(asked)}
+        steered |= {"fresh": read_now(every, next(samples)).astype(np.float64)} if told else {}
+        given = {"sp": sp, "pv": pv, "dv": next(measured), "mv_applied": mv_applied, "state": state}
         try:
-            mv, state, info = controller.step(sp=sp, pv=pv, dv=dv, mv_applied=mv_applied, state=state)
+            mv, state, info = controller.step(**given, **steered)
         except LoopwrightError:
             state = controller.cold_state()
             return mv_applied, (*(0.0 for _ in range(n_info)), 1.0)
         return mv, (*info.tolist(), 0.0)
 
-    return simulate_closed(plant, step, test, noise=noise, seed=seed)
+    return simulate_closed(plant, step, test, noise=noise, seed=seed, every=every)
 
 
 def seized(case: Case, test: Scenario, loop: Trajectory) -> tuple[bool, int]:

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.law_evidence import ColdStart, FormAnalysis, Row
 from loopwright.pipeline.evaluation.metric import TRAVEL
+from loopwright.pipeline.evaluation.operated import OperatedResult
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 
 VALIDATION_SCHEMA = 1
@@ -50,7 +51,8 @@ class LawResult:
     ``locked_up``: test -> data seed -> closed loops that locked up. ``as_printed``: a reproduction of a paper's
     law, which is shipped nevertheless. ``analysis``: by the form's name, ``base`` for the shipped one. ``swings``: as
     ``locked_up``, closed loops that swing to the end. ``withheld``: why it is not shipped, a clause after its name.
-    ``cold_start``: how far from the record's MVs it begins at rests of the record, of a case on models.
+    ``cold_start``: how far from the record's MVs it begins at rests of the record, of a case on models. ``operated``:
+    test -> results where operators change more than set points, of a law with ``operate``.
     """
 
     seeds: int
@@ -62,6 +64,7 @@ class LawResult:
     swings: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
     withheld: str = ""
     cold_start: ColdStart | None = None
+    operated: Mapping[str, OperatedResult] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

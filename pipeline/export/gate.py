@@ -20,8 +20,10 @@ from loopwright.pipeline.laws.base import ControlLaw
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopwrightError
-from loopwright.serving.manifest import INPUTS, SENSITIVE, SWITCHES, Manifest, Signal
+from loopwright.serving.manifest import INPUTS, SENSITIVE, Manifest, Signal
 from loopwright.serving.operating import Operate
+from loopwright.serving.preview.ahead import AheadInput
+from loopwright.serving.preview.differences import Differences
 
 GATE_STEPS = 1_000  # of the loop in which a law and its file are compared
 GATE_TOLERANCE = 1e-9  # largest difference of an MV or a state, relative to its largest value
@@ -73,7 +75,7 @@ def export(
     _check_shapes(law)
     written, inputs = law_graph(law)
     model = fused(written)
-    check_operators(law, model)
+    check_operators(law.name, model)
     manifest = Manifest(
         **{name: getattr(law.signals, name) for name in ("period_s", "sp", "pv", "dv", "mv")},
         case=case,
@@ -84,6 +86,7 @@ def export(
         provenance=dict(provenance),
         evidence={},
         operate=law.operate,
+        ahead=law.ahead,
     )
     with draft_of(path) as draft:
         draft.write_bytes(file_bytes(model.SerializeToString(), manifest))
@@ -173,12 +176,15 @@ def _visited(
     applied, state = np.array([s.middle for s in signals.mv]), np.zeros(law.n_state)
     if law.operate:
         courses |= {"operate": _operated(Operate(law.operate), rng), "fresh": _freshness(len(signals.pv), rng)}
+    known = None if law.ahead is None else _known_future(law.ahead, rng)
     given, answers = [], list[Array]()
     show = progress.steps("the exported file beside the law, step by step", steps)
     for k in range(steps):
         now = {name: course() for name, course in courses.items()} | {"mv_applied": applied, "state": state}
         if drive is not None:
             now["pv"] = np.asarray(drive(applied), dtype=np.float64)
+        if known is not None:
+            now["ahead"] = known(np.concatenate([now["sp"], now["dv"]]))
         try:
             step = controller.step(**now)
         except LoopwrightError as error:
@@ -194,6 +200,8 @@ def _of_law(law: ControlLaw, given: Mapping[str, Array]) -> Iterator[Array]:
     """The law's answers (steps, m) to what the controller was given: side by side, then one by one."""
     inputs = [torch.from_numpy(given[name]) for name in INPUTS if name in given]
     n = len(inputs[0])
+    if "ahead" in given and "operate" not in given:  # it stands behind these two
+        inputs[-1:-1] = [torch.zeros(n, 0, dtype=torch.float64)] * 2
     for size in (STEPS_TOGETHER, 0):
         rows = [slice(k, k + size) for k in range(0, n, size)] if size else range(n)
         try:
@@ -253,7 +261,6 @@ def _course(signals: Sequence[Signal], rng: np.random.Generator, jumps: float | 
 
 
 OPERATED = 1 / 25  # probability a step that an operator changes something
-SWITCHED_ON = 0.85  # of switches that are on
 NOT_FRESH = 0.1  # of readings that are not fresh
 
 
@@ -264,13 +271,7 @@ def _operated(operate: Operate, rng: np.random.Generator) -> Callable[[], Array]
     def step() -> Array:
         nonlocal at
         if rng.uniform() < OPERATED:
-            at = np.array([rng.uniform(e.low, e.high) for e in operate.entries])
-            for i, e in enumerate(operate.entries):
-                if e.what in SWITCHES:
-                    at[i] = float(rng.uniform() < SWITCHED_ON) * e.high
-                elif e.what == "rank":
-                    at[i] = round(at[i])
-            at = operate.ordered(at)
+            at = operate.drawn(rng)
         return at
 
     return step
@@ -278,6 +279,28 @@ def _operated(operate: Operate, rng: np.random.Generator) -> Callable[[], Array]
 
 def _freshness(n: int, rng: np.random.Generator) -> Callable[[], Array]:
     return lambda: (rng.uniform(size=n) > NOT_FRESH).astype(np.float64)
+
+
+KNOWN_ANEW = 1 / 10  # probability a step that somebody gives another course
+UNKNOWN = 0.3  # of courses that say nothing
+
+
+def _known_future(ahead: AheadInput, rng: np.random.Generator) -> Callable[[Array], Array]:
+    """Courses within the signals' ranges, a step or straight over the horizon, as differences from present values."""
+    differences, n = Differences(ahead), len(ahead.signals)
+    low, high = (np.array([getattr(s, end) for s in ahead.signals]) for end in ("low", "high"))
+    at = np.arange(1, ahead.horizon + 1)[:, None]
+    target, begin, takes = low, np.ones(n), np.full(n, np.inf)
+
+    def step(present: Array) -> Array:
+        nonlocal target, begin, takes
+        if rng.uniform() < KNOWN_ANEW:
+            target, begin = rng.uniform(low, high), rng.integers(1, ahead.horizon + 1, n).astype(np.float64)
+            takes = np.where(rng.uniform(size=n) < UNKNOWN, np.inf, rng.choice([1.0, float(ahead.horizon)], n))
+        share = np.clip((at - begin + 1) / takes, 0.0, 1.0)
+        return differences.within((share * (target - present)).ravel(), present)
+
+    return step
 
 
 def _check_shapes(law: ControlLaw) -> None:

@@ -17,6 +17,7 @@ import onnx_ir as ir
 import torch
 from onnx_ir.passes import common as passes
 from onnxscript import optimizer
+from torch import nn
 from torch._ops import OpOverload
 from torch.export import ExportedProgram
 from torch.onnx._internal.exporter import _fx_passes
@@ -128,37 +129,53 @@ OUTPUTS = ("mv", "state_next", "info")
 def law_graph(law: ControlLaw) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     """The graph of one step as the law is written, and the inputs that it uses, in the order of the contract.
 
-    Inputs ``sp, pv, dv, mv_applied, state``, of a law that reads them ``operate, fresh``, and outputs ``mv, state_next,
-    info``, all float64 of rank 1; an input that the law does not use and an output of size zero are left out.
+    Inputs ``sp, pv, dv, mv_applied, state``, of a law that reads them ``operate, fresh, ahead``, and outputs ``mv,
+    state_next, info``, all float64 of rank 1; an input that the law does not use and an output of size zero are left
+    out.
 
     Raises ExportError where the law cannot be such a graph.
     """
+    return module_graph(law, law.name, example_inputs(law), OUTPUTS)
+
+
+def module_graph(
+    module: nn.Module, name: str, example: tuple[torch.Tensor, ...], outputs: tuple[str, ...]
+) -> tuple[onnx.ModelProto, tuple[str, ...]]:
+    """The graph of a module of law ``name``, and the inputs that it uses; both ends as of ``law_graph``.
+
+    It takes vectors of the sizes of the ``example``, in the order of the contract, and gives these ``outputs``.
+    ExportError where it cannot be such a graph.
+    """
     try:
-        traced = _Traced.of(law)
+        traced = _Traced.of(module, example, outputs)
         translated, inputs = _translated(traced)
     except ExportError:
         raise
     except Exception as error:  # torch wraps whatever went wrong in exceptions of its own
-        raise ExportError(f"law {law.name!r} cannot be traced: {_cause(error)}") from error
-    model = ir.from_proto(_filled(translated, law))
+        raise ExportError(f"law {name!r} cannot be traced: {_cause(error)}") from error
+    model = ir.from_proto(_filled(translated, module))
     _simplify(model)
     inputs = tuple(name for name in inputs if any(v.name == name for v in model.graph.inputs))
     proto = ir.to_proto(model)
     proto.ir_version = MAX_IR
     proto.producer_name, proto.producer_version = "loopwright", ""
     del proto.graph.value_info[:], proto.metadata_props[:], proto.graph.metadata_props[:]
-    _check(law, proto)
+    _check(module, name, proto)
     return proto, inputs
 
 
 def example_inputs(law: ControlLaw) -> tuple[torch.Tensor, ...]:
-    """``sp, pv, dv, mv_applied, state`` of the law's sizes, all zero; ``operate`` by its defaults, all ``fresh``."""
+    """``sp, pv, dv, mv_applied, state`` of the law's sizes, all zero; ``operate`` by its defaults, all ``fresh``.
+
+    A law that reads ``ahead`` has the two before it, too, of size zero where it does not read them; zeros then.
+    """
     sizes = (*(len(getattr(law.signals, name)) for name in ("sp", "pv", "dv", "mv")), law.n_state)
     zeros = tuple(torch.zeros(n, dtype=torch.float64) for n in sizes)
-    if not law.operate:
+    if not law.operate and law.ahead is None:
         return zeros
     defaults = torch.tensor([entry.default for entry in law.operate], dtype=torch.float64)
-    return (*zeros, defaults, torch.ones(sizes[1], dtype=torch.float64))
+    steered = (*zeros, defaults, torch.ones(sizes[1] if law.operate else 0, dtype=torch.float64))
+    return steered if law.ahead is None else (*steered, torch.zeros(law.ahead.size, dtype=torch.float64))
 
 
 @dataclass(frozen=True)
@@ -172,16 +189,16 @@ class _Traced:
     text: str
     constants: bytes
     sizes: tuple[int, ...]
+    outputs: tuple[str, ...]
     program: torch.export.ExportedProgram = field(compare=False)
 
     @classmethod
-    def of(cls, law: ControlLaw) -> Self:
-        example = example_inputs(law)
+    def of(cls, module: nn.Module, example: tuple[torch.Tensor, ...], outputs: tuple[str, ...]) -> Self:
         with quiet():
-            program = torch.export.export(law, example, strict=False)
+            program = torch.export.export(module, example, strict=False)
         constants = {name: t.numpy() for name, t in program.constants.items() if isinstance(t, torch.Tensor)}
         values = b"".join(f"{n} {t.dtype} {t.shape}".encode() + t.tobytes() for n, t in sorted(constants.items()))
-        return cls(str(program), values, tuple(map(len, example)), program)
+        return cls(str(program), values, tuple(map(len, example)), outputs, program)
 
 
 @lru_cache(maxsize=16)
@@ -198,11 +215,11 @@ def _translated(traced: _Traced) -> tuple[onnx.ModelProto, tuple[str, ...]]:
     assert program is not None
     assert program.exported_program is not None
     _restore_floats(program.model, _python_floats(program.exported_program))
-    inputs = _name_ends(program.model, traced.sizes)
+    inputs = _name_ends(program.model, traced.sizes, traced.outputs)
     return ir.to_proto(program.model), inputs
 
 
-def _filled(translated: onnx.ModelProto, law: ControlLaw) -> onnx.ModelProto:
+def _filled(translated: onnx.ModelProto, law: nn.Module) -> onnx.ModelProto:
     """The graph with the law's own buffers."""
     proto, buffers = onnx.ModelProto(), law.state_dict()
     proto.CopyFrom(translated)
@@ -251,7 +268,7 @@ def _restore_floats(model: ir.Model, floats: set[float]) -> None:
         node.attributes["value"] = ir.AttrTensor("value", ir.tensor(np.array(next(iter(candidates)))))
 
 
-def _name_ends(model: ir.Model, sizes: tuple[int, ...]) -> tuple[str, ...]:
+def _name_ends(model: ir.Model, sizes: tuple[int, ...], outputs: tuple[str, ...]) -> tuple[str, ...]:
     """Name inputs and outputs by the contract and drop those of size zero.
 
     The names are given here, not to the exporter, which confuses an input with an output where a
@@ -259,7 +276,7 @@ def _name_ends(model: ir.Model, sizes: tuple[int, ...]) -> tuple[str, ...]:
     """
     graph = model.graph
     passes.OutputFixPass()(model)
-    for value, name in zip((*graph.inputs, *graph.outputs), (*INPUTS[: len(sizes)], *OUTPUTS), strict=True):
+    for value, name in zip((*graph.inputs, *graph.outputs), (*INPUTS[: len(sizes)], *outputs), strict=True):
         value.name = name
     for value, size in zip(list(graph.inputs), sizes, strict=True):
         if size == 0:
@@ -293,14 +310,14 @@ def _simplify(model: ir.Model) -> None:
         model.graph.inputs.remove(value)
 
 
-def _check(law: ControlLaw, proto: onnx.ModelProto) -> None:
+def _check(module: nn.Module, name: str, proto: onnx.ModelProto) -> None:
     """ExportError for what ``check_operators`` refuses, or a changed buffer."""
-    check_operators(law, proto)
-    buffers = law.state_dict()
+    check_operators(name, proto)
+    buffers = module.state_dict()
     for tensor in proto.graph.initializer:
         value = onnx.numpy_helper.to_array(tensor)
         if tensor.name in buffers and not np.array_equal(value, buffers[tensor.name].numpy(), equal_nan=True):
-            raise ExportError(f"law {law.name!r}: buffer {tensor.name!r} changed on its way into the graph")
+            raise ExportError(f"law {name!r}: buffer {tensor.name!r} changed on its way into the graph")
 
 
 def _cause(error: Exception) -> str:
@@ -315,22 +332,22 @@ def _cause(error: Exception) -> str:
 RESHAPING = frozenset({"Flatten", "Gather", "Gemm", "MatMul", "Reshape", "Squeeze"})
 
 
-def check_operators(law: ControlLaw, proto: onnx.ModelProto) -> None:
+def check_operators(law: str, proto: onnx.ModelProto) -> None:
     """ExportError for an operator off the list, a transposed product or a float32 value."""
     try:
         audit(proto.SerializeToString())
     except ArtifactError as error:
-        raise ExportError(f"law {law.name!r}: {error}") from error
+        raise ExportError(f"law {law!r}: {error}") from error
     products = _transposed_products(proto.graph)
     if products:
         raise ExportError(
-            f"law {law.name!r}: {products[0]} multiplies a transposed matrix, which onnxruntime below 1.26 refuses; "
+            f"law {law!r}: {products[0]} multiplies a transposed matrix, which onnxruntime below 1.26 refuses; "
             "write the product as a sum, (a * b).sum(-1), or keep the matrix transposed in a buffer"
         )
     narrow = {onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16}
     casts = [a.i for n in proto.graph.node if n.op_type == "Cast" for a in n.attribute if a.name == "to"]
     if narrow & {*casts, *(t.data_type for t in proto.graph.initializer)}:
-        raise ExportError(f"law {law.name!r} computes in float32 somewhere; make its constants and casts float64")
+        raise ExportError(f"law {law!r} computes in float32 somewhere; make its constants and casts float64")
 
 
 def _transposed_products(graph: onnx.GraphProto) -> list[str]:

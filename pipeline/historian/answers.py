@@ -24,6 +24,9 @@ from loopwright.pipeline.metrics import Array
 FINE_LAGS = 6  # lags with a coefficient of their own; later ones share one
 LAG_BLOCK_GROWTH = 1.5  # a block over the one before
 MOST_LAGS, FEWEST_LAGS = 160, 10  # lags
+WIDE_BLOCKS = ((0, 4), (4, 8), (8, 14), (14, 23), (23, 37), (37, 57), (57, 87), (87, 120), (120, 160))  # lags of inputs
+"""Wide ones, for a PV with few readings: its answer settles within MOST_LAGS, and a block has a few rows at least."""
+MOST_MEMORY = 0.95  # of an error for the one of the reading before: with more its mean is free
 ROWS_A_COEFFICIENT = 6  # rows for each coefficient of the model: of the PV, the inputs and a constant
 SCORES = 40  # parts of the rows whose sums say how far the coefficients may be off
 # eigenvalue of the regressors' covariance, over the largest, below which a direction never moved
@@ -47,14 +50,46 @@ class DirectModel:
     rows: int
 
     @classmethod
-    def of(cls, y: Array, u: Array, run: NDArray[np.int64], longest: int = 40) -> DirectModel | None:
-        """Fit to a PV y (n,) and its inputs u (n, m), with lags up to ``longest`` rows; None where rows are too few."""
+    def of(
+        cls, y: Array, u: Array, run: NDArray[np.int64], longest: int = 40, read: NDArray[np.bool_] | None = None
+    ) -> DirectModel | None:
+        """Fit to a PV y (n,) and its inputs u (n, m), with lags up to ``longest`` rows; None where rows are too few.
+
+        ``read`` (n,) are the rows with a new reading, see ``of_readings``; None: all.
+        """
+        if read is not None:
+            return cls.of_readings(y, u, run, read)
         longest = min(max(longest, FEWEST_LAGS), MOST_LAGS)
         while (model := cls.of_blocks(y, u, run, [blocks_to(longest)] * (1 + u.shape[1]))) is None:
             if longest <= FEWEST_LAGS:
                 return None
             longest = max(longest // 2, FEWEST_LAGS)
         return model
+
+    @classmethod
+    def of_readings(cls, y: Array, u: Array, run: NDArray[np.int64], read: NDArray[np.bool_]) -> DirectModel | None:
+        """Fit to the readings of y (n,) at the rows ``read`` (n,), from inputs u (n, m); None where these are too few.
+
+        The PV is not known row by row, so that its past tells by the error of the reading before alone:
+
+            y(k+1) = sum_j sum_b b_jb mean(u_j over block b) + c + w(k+1),   w(i) = rho w(i - 1) + e(i) over readings
+        """
+        blocks = (((0, 1),), *(WIDE_BLOCKS for _ in range(u.shape[1])))
+        longest = WIDE_BLOCKS[-1][1]
+        k = np.flatnonzero(read[1:])
+        k = k[(k >= longest) & (run[np.maximum(k - longest, 0)] == run[k + 1])]
+        coefficients = len(WIDE_BLOCKS) * u.shape[1] + 1
+        if len(k) - 1 < ROWS_A_COEFFICIENT * coefficients:
+            return None
+        columns = [blocks_of(c - c.mean(), k, WIDE_BLOCKS) for c in u.T]
+        x, target = np.column_stack([*columns, np.ones(len(k))]), y[k + 1] - y[read].mean()
+        left = target - x @ np.linalg.lstsq(x, target, rcond=1e-10)[0]
+        memory = float(np.clip(left[1:] @ left[:-1] / max(float(left @ left), 1e-300), 0.0, MOST_MEMORY))
+        x = np.column_stack([x[1:, :-1] - memory * x[:-1, :-1], x[1:, -1]])
+        theta, covariance, sd = _least_squares(x, target[1:] - memory * target[:-1])
+        whole, spread = np.zeros(len(theta) + 1), np.zeros((len(theta) + 1, len(theta) + 1))
+        whole[1:], spread[1:, 1:] = theta, covariance
+        return cls(whole, spread, blocks, sd, len(k))
 
     @classmethod
     def of_blocks(cls, y: Array, u: Array, run: NDArray[np.int64], blocks: Sequence[Blocks]) -> DirectModel | None:
@@ -66,21 +101,8 @@ class DirectModel:
             return None
         columns = [blocks_of(c - c.mean(), k, of) for c, of in zip((y, *u.T), blocks, strict=True)]
         x = np.column_stack([*columns, np.ones(len(k))])
-        target = y[k + 1] - y.mean()
-        scale = np.where(x.std(axis=0) > 0, x.std(axis=0), 1.0)
-        z, n = x / scale, len(k)
-        values, vectors = np.linalg.eigh(z.T @ z / n)
-        least = FLAT_EIGENVALUE * values[-1]
-        moved = values > least
-        known, lost = vectors[:, moved], vectors[:, ~moved]
-        inverse = (known / values[moved]) @ known.T
-        theta = inverse @ (z.T @ target / n)
-        e = target - z @ theta
-        edges = np.linspace(0, n, SCORES + 1).astype(int)
-        scores = np.array([z[i:j].T @ e[i:j] for i, j in pairwise(edges)]) / n
-        white = float(e.var()) / n
-        covariance = white * (inverse + lost @ lost.T / least) + inverse @ (scores.T @ scores) @ inverse
-        return cls(theta / scale, covariance / np.outer(scale, scale), tuple(blocks), float(e.std()), n)
+        theta, covariance, sd = _least_squares(x, y[k + 1] - y.mean())
+        return cls(theta, covariance, tuple(blocks), sd, len(k))
 
     def answer(self, j: int, first: int, last: int) -> tuple[float, float]:
         """(mean answer over rows ``first`` to ``last`` after a unit step of input j, its standard deviation).
@@ -117,6 +139,24 @@ class DirectModel:
                 past = y[:, k : k + longest][:, ::-1]
                 y[:, longest + k] = np.einsum("ij,ij->i", own, past) + pushes[:, min(k, pushes.shape[1] - 1)]
         return y[:, longest:]
+
+
+def _least_squares(x: Array, target: Array) -> tuple[Array, Array, float]:
+    """(theta (p,), its covariance (p, p), standard deviation of what is left) of target (n,) on columns x (n, p)."""
+    scale = np.where(x.std(axis=0) > 0, x.std(axis=0), 1.0)
+    z, n = x / scale, len(x)
+    values, vectors = np.linalg.eigh(z.T @ z / n)
+    least = FLAT_EIGENVALUE * values[-1]
+    moved = values > least
+    known, lost = vectors[:, moved], vectors[:, ~moved]
+    inverse = (known / values[moved]) @ known.T
+    theta = inverse @ (z.T @ target / n)
+    e = target - z @ theta
+    edges = np.linspace(0, n, SCORES + 1).astype(int)
+    scores = np.array([z[i:j].T @ e[i:j] for i, j in pairwise(edges)]) / n
+    white = float(e.var()) / n
+    covariance = white * (inverse + lost @ lost.T / least) + inverse @ (scores.T @ scores) @ inverse
+    return theta / scale, covariance / np.outer(scale, scale), float(e.std())
 
 
 def _by_lag(thetas: Array, blocks: Blocks) -> Array:

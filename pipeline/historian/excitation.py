@@ -234,7 +234,10 @@ def _input(
     seen = {n: m for n, m in models.items() if m and answers[n] > SEEN_STRENGTH}
     settling = {n: m.settling(i) for n, m in seen.items()}
     sure = tuple(n for n in settling if i in certain_of[n])
-    first = {n: first_answer(y, u, record.run) for n, y in pvs.items()} if held >= HELD_ROWS else {}
+    # Between an analyser's readings nobody knows when an answer begins.
+    seldom = {record.pv_signals[i].name for i in record.seldom}
+    quick = {n: y for n, y in pvs.items() if n not in seldom}
+    first = {n: first_answer(y, u, record.run) for n, y in quick.items()} if held >= HELD_ROWS else {}
     median, largest = (float(np.median(moves)), float(moves.max())) if moves.size else (0.0, 0.0)
     return InputReport(
         name=signal.name,

@@ -8,7 +8,7 @@ from dataclasses import replace
 from loopwright.pipeline.config.exports import ExportedTag, ExportParams
 from loopwright.pipeline.config.plants import MvParams, PlantParams, SignalParams
 from loopwright.pipeline.errors import ParamsError
-from loopwright.pipeline.historian.cleaning.tags import COMMANDS, SIGNAL_ROLES, Tag, named, safe_name
+from loopwright.pipeline.historian.cleaning.tags import COMMANDS, SIGNAL_ROLES, Tag, named, of_role, safe_name
 from loopwright.pipeline.historian.files.file_reader import read_export, units_of
 from loopwright.pipeline.historian.guessing import controlled_first, loop_of
 from loopwright.pipeline.historian.screening import Screened, screen_export
@@ -113,18 +113,20 @@ def exported(tag: Tag) -> ExportedTag:
     name = "" if tag.name == safe_name(tag.tag) else tag.name
     # What column loop says as the name does needs no word.
     said = (tag.unit_certain, tag.between, tag.ends, "" if tag.loop == loop_of(tag.tag) else tag.loop)
-    return ExportedTag(tag.tag, tag.role, tag.unit, tag.low, tag.high, name, *said)  # type: ignore[arg-type]
+    return ExportedTag(tag.tag, tag.stated_role, tag.unit, tag.low, tag.high, name, *said)  # type: ignore[arg-type]
 
 
 def signal_tags(tags: Sequence[ExportedTag]) -> tuple[Tag, ...]:
     """The tags with the names and in the order of the plant's signals; units as given."""
     given = [
-        Tag(
-            *(t.tag, t.role, t.unit, t.low, t.high, t.name),
-            unit_certain=t.unit_certain,
-            between=t.between,
-            ends=t.ends,
-            loop=t.loop,
+        of_role(
+            Tag(
+                *(t.tag, t.role, t.unit, t.low, t.high, t.name),
+                unit_certain=t.unit_certain,
+                between=t.between,
+                ends=t.ends,
+                loop=t.loop,
+            )
         )
         for t in tags
     ]

@@ -212,9 +212,13 @@ def _answers(y: Array, u: Sequence[Array], run: NDArray[np.int64]) -> bool:
 
 
 def controlled_first(tags: Sequence[Tag]) -> tuple[Tag, ...]:
-    """The tags, the PVs whose loop has a set point before the others."""
+    """The tags, the PVs whose loop has a set point before the others, and those that have none by their role last."""
     loops = {loop for t in tags if t.role == "sp" and (loop := loop_in(t))}
-    return tuple(sorted(tags, key=lambda t: t.role == "pv" and loop_in(t) not in loops)) if loops else tuple(tags)
+
+    def place(tag: Tag) -> int:
+        return 2 if tag.constraint else int(bool(loops) and tag.role == "pv" and loop_in(tag) not in loops)
+
+    return tuple(sorted(tags, key=place))
 
 
 def loops_in(tags: Sequence[Tag]) -> dict[str, dict[str, list[str]]]:

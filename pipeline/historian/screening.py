@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import tzinfo
 
@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
+from loopwright.pipeline.historian.analyser_readings import in_place
 from loopwright.pipeline.historian.arx_model import Linear, believed
 from loopwright.pipeline.historian.cleaning.findings import Finding, RecordJudgement, Screening, TagReport, counted
+from loopwright.pipeline.historian.cleaning.new_readings import new_readings, put_analysers
 from loopwright.pipeline.historian.cleaning.outliers_and_units import usual
 from loopwright.pipeline.historian.cleaning.record_rows import (
     WINDOWED,
@@ -32,7 +34,7 @@ from loopwright.pipeline.historian.cleaning.response_consistency import contradi
 from loopwright.pipeline.historian.cleaning.row_grid import Grid, resampled
 from loopwright.pipeline.historian.cleaning.sampling import TagSampling, proposed_period, sampling
 from loopwright.pipeline.historian.cleaning.tag_checks import flag_bad_readings, reasons_of, with_texts_of_one_side
-from loopwright.pipeline.historian.cleaning.tags import Tag, commanded_range
+from loopwright.pipeline.historian.cleaning.tags import SIGNAL_ROLES, Tag, commanded_range
 from loopwright.pipeline.historian.drift import explained, of_levels, of_quick_models
 from loopwright.pipeline.historian.excitation import SEEN_STRENGTH, judged, moves_of, with_rows_out_of_range
 from loopwright.pipeline.historian.files.export import Export, Series
@@ -60,8 +62,10 @@ from loopwright.serving.manifest import Signal
 
 
 # ---------------------------------------------------------------------------------- process variables that no MV moves
-def findings_of_answers(pvs: Sequence[str], verdict: RecordJudgement) -> list[Finding]:
-    """One finding for each PV that answers to no MV, and one where not every PV can be controlled.
+def findings_of_answers(
+    pvs: Sequence[str], verdict: RecordJudgement, constraints: Collection[str] = ()
+) -> list[Finding]:
+    """One finding for each PV that answers to no MV, and one where not every PV with a set point can be controlled.
 
     Empty where no PV answers at all: then the verdict says what is wrong with the MVs. ``pvs`` are names, in order.
     """
@@ -70,6 +74,7 @@ def findings_of_answers(pvs: Sequence[str], verdict: RecordJudgement) -> list[Fi
     found = []
     if len(unmoved) < len(pvs):
         found += [Finding("unmoved", n, "answers to no MV: leave its role empty, or make it dv") for n in unmoved]
+    pvs = [name for name in pvs if name not in constraints]
     if len(pvs) > len(mvs):
         first, others = ", ".join(pvs[: len(mvs)]), ", ".join(pvs[len(mvs) :])
         words = (
@@ -115,6 +120,13 @@ def screen_export(
     RecordError where nothing of a signal is left, or its given range misses most of its readings.
     """
     own = {t.tag: replace(export.series[t.tag], between=t.between) for t in tags}
+    listed, analysers = tags, [t for t in tags if t.analyser]
+    tags = quick = [t for t in tags if not t.analyser]
+    if not any(t.role == "pv" for t in tags):
+        raise RecordError(
+            f"{analysers[0].tag} is an analyser, and there is no other process variable; name one that is read in each "
+            "row, or give the analyser the role pv: a row is then as long as its readings are apart"
+        )
     check_modes(without_modes, tags, own)
     findings: list[Finding] = [*of_notes(export), *of_files(export, tags)]
     spans = spans_of(leave_out, export)
@@ -138,9 +150,12 @@ def screen_export(
     findings += of_rows(pvs, period, step)
     role_of = {t.tag: t.role for t in tags}
     findings += [
-        f for s in own.values() for f in check_readings(s, sampling(s, period, hold_s), role_of[s.tag], period)
+        f
+        for t in tags
+        for s in (own[t.tag],)
+        for f in check_readings(s, sampling(s, period, hold_s), role_of[s.tag], period)
     ]
-    steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in tags}
+    steps = {t.tag: quantum(own[t.tag].value[own[t.tag].good]) if t.role != "mode" else 0.0 for t in listed}
 
     counts_of: dict[str, dict[str, int]] = {}
 
@@ -169,10 +184,16 @@ def screen_export(
     findings += mask_stuck_and_saturated(grid, signals, by_tag)
     findings += of_zeros(grid, signals)
     findings += mask_contradictions(grid, signals)
+    for t in analysers:
+        own[t.tag] = new_readings(own[t.tag], step)
+        findings += flag_bad_readings(own[t.tag], t)
+        counts_of[t.tag], by_tag[t.tag] = own[t.tag].counts(), sampling(own[t.tag], period)
+    findings += put_analysers(grid, analysers, own)
+    tags, signals = listed, [t for t in listed if t.role in SIGNAL_ROLES]
     findings += [f for t in tags if t.role == "mode" for f in of_mode(own[t.tag], grid.value[t.tag])]
     code = row_codes(grid, signals, tags, own, without_modes)
     record = replace(record_of(grid, code, signals), fed_back=pace.fed_back)
-    excerpt = evenly(record)
+    excerpt = in_place(evenly(record))
     models = models_of(excerpt)
     moved = max(
         (len(moves_of(grid.value[t.tag][code == 0][:WINDOWED], record.run[:WINDOWED])) for t in tags if t.role == "sp"),
@@ -186,7 +207,8 @@ def screen_export(
     verdict = with_levels(verdict, excerpt, tags)
     verdict = with_rows_out_of_range(verdict, int(counts[Reason.RANGE]), len(code))
     verdict = with_texts_of_one_side(verdict, findings)
-    findings += findings_of_answers([s.name for s in record.pv_signals], verdict)
+    constraints = {t.name for t in tags if t.constraint}
+    findings += findings_of_answers([s.name for s in record.pv_signals], verdict, constraints)
     reports = tuple(
         _tag_report(t, own[t.tag], grid, record, by_tag[t.tag], counts_of[t.tag], steps[t.tag]) for t in tags
     )
@@ -212,8 +234,8 @@ def screen_export(
         findings=merged(spelt(findings, tags)),
         verdict=verdict,
         zone=export.zone,
-        operated=operated(grid, code, tags, modes),
-        old_controllers=old_controllers(grid, code, tags, modes),
+        operated=operated(grid, code, quick, modes),
+        old_controllers=old_controllers(grid, code, quick, modes),
     )
     return Screened(record, grid, code, own, report, step, models, export.local)
 

@@ -15,6 +15,7 @@ from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.plants.simulator import Array, Signals, Simulator
 from loopwright.serving.manifest import OperateEntry
+from loopwright.serving.preview.ahead import AheadInput
 
 M = TypeVar("M", bound=Model)
 Stepped: TypeAlias = tuple[Tensor, Tensor, Tensor]
@@ -115,6 +116,7 @@ class ControlLaw(nn.Module, ABC):
     n_state: int
     info: tuple[str, ...]
     operate: tuple[OperateEntry, ...] = ()  # of a law with two more inputs: what operators change, and fresh readings
+    ahead: AheadInput | None = None  # of a law with one more input: set points and measured disturbances to come
     low: Tensor  # (n_mv,)
     high: Tensor  # (n_mv,)
     rate: Tensor | None  # (n_mv,) largest change a sample, infinite without a limit; None where no MV has one

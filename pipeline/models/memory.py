@@ -119,7 +119,8 @@ class AffineMap(nn.Module):
         self.register_buffer("matrix", (table[:-1] - table[-1]).contiguous())
         self.register_buffer("offset", table[-1].clone())
 
-    def forward(self, x: Tensor) -> dict[str, Tensor]:
-        """The results at x (..., n)."""
-        parts = torch.split(x @ self.matrix + self.offset, list(self.sizes.values()), dim=-1)
+    def forward(self, x: Tensor, offset: Tensor | None = None) -> dict[str, Tensor]:
+        """The results at x (..., n); ``offset`` (..., sum of k) in place of the map's own."""
+        constant = self.offset if offset is None else offset
+        parts = torch.split(x @ self.matrix + constant, list(self.sizes.values()), dim=-1)
         return dict(zip(self.sizes, parts, strict=True))

@@ -17,7 +17,7 @@ from loopwright.pipeline.evaluation.metric import METRICS, Metric
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.metrics import mv_travel
 from loopwright.pipeline.plants.simulator import Simulator
-from loopwright.serving.manifest import Signal
+from loopwright.serving.manifest import OperateEntry, Signal
 
 Array = NDArray[np.float64]
 STAYING_PART = 10  # an error stays that is there over the last tenth of a run
@@ -39,6 +39,14 @@ class History:
     measured: list[Array] = field(default_factory=list)
     mv: list[Array] = field(default_factory=list)
     reason: list[str] = field(default_factory=list)
+    mv0: Array | None = None  # (n_mv,) before the first scan
+    entries: tuple[OperateEntry, ...] = ()  # of what operators may change of the law
+    operate: list[Array] = field(default_factory=list)  # (n_operate,) a scan; empty without such entries
+
+    def of_entry(self, name: str) -> Array | None:
+        """The course (n,) of an entry of ``operate``, as ``TIC-1.track``; None where the law has no such entry."""
+        places = {entry.name: i for i, entry in enumerate(self.entries)}
+        return np.array(self.operate)[:, places[name]] if self.operate and name in places else None
 
 
 def summary(plant: Simulator, history: History, metric: Metric = METRICS["mae"]) -> str:
@@ -47,22 +55,47 @@ def summary(plant: Simulator, history: History, metric: Metric = METRICS["mae"])
     lines = []
     for i, s in enumerate(plant.sp_signals):
         unit = "" if s.unit == "-" else f" {s.unit}"
+        follows = _follows(history, s)
+        if not follows.all():
+            part = 100 * float(np.mean(~follows))
+            lines.append(f"{s.name} follows no set point for {part:.3g} % of the time, which is no error")
+            if not follows.any():
+                continue
+        r, y = sp[follows, i], pv[follows, i]
         errors = [
-            f"{m.short} {s.name} {m.of(sp[:, i], pv[:, i]):.{6 if m.squared else 4}g} {m.unit_of(s.unit)}".rstrip()
+            f"{m.short} {s.name} {m.of(r, y):.{6 if m.squared else 4}g} {m.unit_of(s.unit)}".rstrip()
             for m in dict.fromkeys((metric, METRICS["mae"]))
             if m.of is not None
         ]
-        lines.append(f"{', '.join(errors)}, final error {sp[-1, i] - pv[-1, i]:.3g}{unit}")
+        lines.append(f"{', '.join(errors)}, final error {r[-1] - y[-1]:.3g}{unit}")
     for i, s in enumerate(plant.mv_signals):
         if s.values is None:
-            lines.append(f"travel of {s.name} {mv_travel(mv[:, i]):.5g}" + ("" if s.unit == "-" else f" {s.unit}"))
+            lines.append(
+                f"travel of {s.name} {_travel(mv[:, i], history, i):.5g}" + ("" if s.unit == "-" else f" {s.unit}")
+            )
         else:
             lines.append(f"changes of {s.name} {np.count_nonzero(np.diff(mv[:, i]))}")
-    lines += _jammed(plant, pv[:, : sp.shape[1]] - sp, mv)
+    followed = np.column_stack([_follows(history, s) for s in plant.sp_signals])
+    lines += _jammed(plant, np.where(followed, pv[:, : sp.shape[1]] - sp, 0.0), mv)
     faults = sum(map(bool, history.reason))
     if faults:
         lines.append(f"{faults} scans with a fault, the last one: {next(r for r in reversed(history.reason) if r)}")
     return "\n".join(lines)
+
+
+def _follows(history: History, s: Signal) -> NDArray[np.bool_]:
+    """Scans (n,) at which a PV follows its set point: all of them, unless operators let it go."""
+    found = np.ones(len(history.sp), dtype=bool)
+    for what in ("use", "track"):
+        course = history.of_entry(f"{s.name}.{what}")
+        if course is not None:
+            found &= course > 0
+    return found
+
+
+def _travel(mv: Array, history: History, i: int) -> float:
+    """Travel of an MV (n,), with its first move where it is known from where."""
+    return mv_travel(mv if history.mv0 is None else np.concatenate([history.mv0[i : i + 1], mv]))
 
 
 def _jammed(plant: Simulator, error: Array, mv: Array) -> list[str]:

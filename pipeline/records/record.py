@@ -20,13 +20,15 @@ from loopwright.serving.manifest import Signal
 STEP_TOLERANCE = 1e-3  # of the period: what a logger's rounded time stamps may stray
 MV_TOLERANCE = 1e-9  # of a signal's span
 FED_BACK = "fed_back"  # name in a Parquet file's metadata
+FRESH = " fresh"  # end of the name of a column that says which rows have a new reading of a PV
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
     """Rows of one or more runs. Row k: the PVs measured at sample k, the MVs held over [k, k+1).
 
-    Values are in the units of their signals. The MV of a run's last row acts after the data end.
+    Values are in the units of their signals. The MV of a run's last row acts after the data end. ``fresh`` says in
+    which rows a PV has a new reading: an analyser has one now and then, and what stands in ``pv`` between is none.
     """
 
     period_s: float  # [s] sampling period, the same in every run
@@ -39,6 +41,7 @@ class Record:
     mv: Array  # (N, n_mv)
     dv: Array  # (N, n_dv)
     fed_back: bool = False  # its readings show that an MV follows a PV, which rows averaged from them may hide
+    fresh: NDArray[np.bool_] | None = None  # (N, n_pv) rows with a new reading; None: all are
 
     def __post_init__(self) -> None:
         n = len(self.run)
@@ -47,6 +50,10 @@ class Record:
             found = getattr(self, name).shape
             if found != shape:
                 raise RecordError(f"record: {name} has shape {found}; {n} rows and its signals need {shape}")
+        if self.fresh is not None and self.fresh.shape != wanted["pv"]:
+            raise RecordError(
+                f"record: fresh has shape {self.fresh.shape}; {n} rows and its signals need {wanted['pv']}"
+            )
         broken = broken_run(self.run)
         if broken is not None:
             raise RecordError(
@@ -97,12 +104,27 @@ class Record:
         sha.update(np.ascontiguousarray(self.run, dtype="<i8").tobytes())
         for values in (self.time_s, self.pv, self.mv, self.dv):
             sha.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
+        if self.fresh is not None:
+            sha.update(np.ascontiguousarray(self.fresh, dtype="<i8").tobytes())
         return sha.hexdigest()
+
+    def at(self, rows: NDArray[np.int64] | slice, run: NDArray[np.int64] | None = None) -> Self:
+        """Some rows, with the runs that they had, or those of ``run``."""
+        taken = {name: getattr(self, name)[rows] for name in ("time_s", "pv", "mv", "dv")}
+        fresh = None if self.fresh is None else self.fresh[rows]
+        return replace(self, run=self.run[rows] if run is None else run, fresh=fresh, **taken)
+
+    @property
+    def seldom(self) -> dict[int, NDArray[np.bool_]]:
+        """PV -> the rows (N,) with a new reading, of the PVs that have none in some rows."""
+        found = {} if self.fresh is None else dict(enumerate(self.fresh.T))
+        return {i: of for i, of in found.items() if not of.all()}
 
     def write(self, path: Path) -> None:
         """Write the record as ``.parquet`` or ``.csv``; no half-written file is left under that name."""
         columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {"run": self.run, "time_s": self.time_s}
         columns |= dict(zip(self.columns, (*self.pv.T, *self.mv.T, *self.dv.T), strict=True))
+        columns |= {self.pv_signals[i].name + FRESH: of.astype(np.float64) for i, of in self.seldom.items()}
         signals = {"pv": self.pv_signals, "mv": self.mv_signals, "dv": self.dv_signals}
         described = {kind: [s.to_dict() for s in group] for kind, group in signals.items()}
         told = {FED_BACK: True} if self.fed_back else {}
@@ -113,7 +135,8 @@ class Record:
         """The record in a Parquet or CSV file, checked against the plant's signals and period.
 
         Columns: ``time_s``, one ``NAME [unit]`` a signal, and ``run`` where the file holds more
-        than one run; others are ignored. Time may start anywhere; in the record each run starts at 0.
+        than one run; others are ignored, but for ``NAME fresh``: 1 where a PV has a new reading. Time may start
+        anywhere; in the record each run starts at 0.
 
         Raises RecordError, naming file, column and row, for a missing column, another unit, a cell that is not a
         finite number, time that is not uniform or not at ``period_s``, a run in pieces, a PV mostly outside its
@@ -134,7 +157,11 @@ class Record:
             check_mv(table, signal, values)
         # ``of`` puts times on the exact grid, so that a file's rounded time stamps do not change the digest.
         found = cls.of(signals, pv, mv, run=runs.astype(np.int64), dv=dv)
-        return replace(found, fed_back=bool(table.told.get(FED_BACK)))
+        names = {s.name + FRESH: i for i, s in enumerate(signals.pv) if s.name + FRESH in table.header}
+        fresh = np.ones(pv.shape, dtype=np.bool_)
+        for name, i in names.items():
+            fresh[:, i] = table.numbers(name) > 0
+        return replace(found, fed_back=bool(table.told.get(FED_BACK)), fresh=fresh if names else None)
 
 
 def position_in_run(run: NDArray[np.int64]) -> NDArray[np.int64]:

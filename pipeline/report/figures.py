@@ -30,8 +30,10 @@ from loopwright.pipeline.pictures.model_pictures import (
     predictions_picture,
     replay_picture,
 )
+from loopwright.pipeline.pictures.operated_pictures import operated_picture
 from loopwright.pipeline.pictures.tuning_pictures import TravelCurve, travel_picture
 from loopwright.pipeline.pictures.words import law_name, scenario_name
+from loopwright.pipeline.report.operated_tables import picture_name
 from loopwright.pipeline.report.own_acceptance import shipped_laws, worst_test
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
@@ -54,7 +56,8 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
     ``closed_loop_<law>.png`` shows each law beside the case's baseline on the test that weighs most, and
     ``closed_loop.png`` the best one; ``worst_<law>.png`` the test that says most against it, ``cycle_<law>.png`` its
     worst limit cycle, ``tuning_<law>.png`` the numbers that its search tried; ``candidates_<set>_<part>.png`` the
-    search over a model's size; ``closed_loop_test_<test>.png`` a test that moves measured disturbances; ``own`` are the
+    search over a model's size; ``operated_<law>_<test>.png`` a test in which operators change more than set points;
+    ``closed_loop_test_<test>.png`` a test that moves measured disturbances; ``own`` are the
     pictures that only this case has.
     Raises ReportError where two pictures have the same file name.
     """
@@ -88,6 +91,10 @@ def draw_all(evidence: Evidence, folder: Path, own: Iterable[CasePicture] = ()) 
                     keep(f"worst_{name}", overview_picture(evidence, name, test), f"{title} on {words}")
             with suppress(NotMeasuredError):
                 keep(f"cycle_{name}", *cycle_picture(evidence, name))
+            for test, result in law.metrics.operated.items():
+                with suppress(NotMeasuredError):
+                    canvas, words = operated_picture(evidence, name, test)
+                    keep(picture_name(name, test).removesuffix(".png"), canvas, f"{title}. {result.title}{words}")
             with suppress(NotMeasuredError):
                 keep(f"replay_{name}", replay_picture(evidence, name), f"{title}, replayed over the record")
             with suppress(NotMeasuredError):

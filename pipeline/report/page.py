@@ -21,6 +21,7 @@ from loopwright.pipeline.pictures.words import law_name, scenario_name
 from loopwright.pipeline.report.figures import draw_all, main_words
 from loopwright.pipeline.report.identified_model import ANSWERS, TRIED, VARIABLES, model_section
 from loopwright.pipeline.report.law_tables import analyses, further_figures, law_row, scenario_rows
+from loopwright.pipeline.report.operated_tables import MVS, PROFITS, RANGES, operated_tables
 from loopwright.pipeline.report.own_acceptance import (
     against,
     beyond_reach,
@@ -126,6 +127,9 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "gone_wrong": wrong_rows(evidence),
         "late": [words for law in shipped if (words := dead_time_to_state(evidence, law))],
         "further": further_figures(evidence),
+        "operator_tests": operated_tables(evidence, pictures),
+        "operator_heads": (RANGES, MVS, PROFITS),
+        "operator_pictures": of_kind("operated_"),
         "analyses": analyses(evidence),
         "tuning_pictures": of_kind("tuning_"),
         "bound_notes": _bound_notes(evidence),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import zip_longest
 from pathlib import Path
 
@@ -15,9 +15,11 @@ from loopwright.pipeline.config.params import PARAMS_FILE, entries, sections
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.evaluation.leaderboard import CaseStanding, LawStanding, by_reason, tally, withheld_in
 from loopwright.pipeline.evaluation.metric import with_unit
+from loopwright.pipeline.evaluation.operated import summary_of
 from loopwright.pipeline.evaluation.validation import FILE, Validation
 from loopwright.pipeline.pictures.numbers import ratio
 from loopwright.pipeline.simulation import NOISE_SUFFIX
+from loopwright.serving.controller_file import controller_files
 
 RESULTS_WIDTH = 120  # letters of the table, where no terminal says how wide it is
 REMARK_RATIO = 0.99  # ratio to the bound below which a remark says why
@@ -100,7 +102,7 @@ def show_results(artifacts: Path, console: Console | None = None, case: str | No
         console.print(f"report     {where / 'report.html'} (and .md, figures/, validation.json)")
     # In quotes where a word has to be put in: a shell takes the brackets for something else.
     one = f"{where / best}.onnx" if best is not None else f"'{where / '<law>.onnx'}'"
-    if any(any(standing.folder.glob("*.onnx")) for name, standing in standings.items() if case in (None, name)):
+    if any(controller_files(standing.folder) for name, standing in standings.items() if case in (None, name)):
         console.print(f"try one    loopwright simulate {one}")
         console.print(f"read one   loopwright inspect {one}")
     console.print("registry   make registry, then /#/models in the browser")
@@ -126,7 +128,7 @@ def _beside_the_best(standing: CaseStanding, shipped: Iterable[LawStanding]) -> 
 def without_controller(artifacts: Path, case: str) -> bool:
     """Whether a case has a report and withholds every law, so that its folder in ``artifacts`` has no controller."""
     folder = artifacts / case
-    return (folder / FILE).is_file() and bool(withheld_in(folder)) and not any(folder.glob("*.onnx"))
+    return (folder / FILE).is_file() and bool(withheld_in(folder)) and not controller_files(folder)
 
 
 def _given(params: Path, case: str) -> tuple[str, ...] | None:
@@ -207,9 +209,19 @@ def _tests(standing: CaseStanding) -> Table:
     if standing.travel:
         travels = (standing.travel_bound, *(law.travel for law in standing.laws))
         table.add_row(escape(f"{standing.travel}, {standing.travel_test}"), *map(_figure, travels))
+    for words, row in _operated(validation, [law.law for law in standing.laws]):
+        table.add_row(words, "", *row)
     table.add_row("lock-ups", "", *(("-" if law.lock_ups is None else str(law.lock_ups)) for law in standing.laws))
     table.add_row("size", "", *map(_size, standing.laws))
     return table
+
+
+def _operated(validation: Validation, laws: Iterable[str]) -> Iterator[tuple[str, list[str]]]:
+    """Rows on tests in which operators change more than set points: the worst of each law; none without such a law."""
+    found = [summary_of(validation.laws[law].operated) for law in laws]
+    for name, words in (("outside_late", "outside a range, % of time"), ("gain", "profit, % of what is to be gained")):
+        if any(name in of for of in found):
+            yield words, ["-" if name not in of else f"{100 * of[name]:.3g}" for of in found]
 
 
 def _size(law: LawStanding) -> str:

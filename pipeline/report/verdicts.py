@@ -22,6 +22,7 @@ from loopwright.pipeline.evaluation.verdicts import ABSOLUTE, RELATIVE, Claims, 
 from loopwright.pipeline.files import digest
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.words import curve_label, law_name
+from loopwright.pipeline.report.operated_tables import operated_rows
 from loopwright.pipeline.report.own_acceptance import own_acceptance
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 
@@ -109,6 +110,7 @@ def acceptance(evidence: Evidence, claims: Claims) -> list[CheckedStatement]:
     ]
     if evidence.case.on_models:
         common = own_acceptance(evidence)
+    common += operated_rows(evidence)
     rows = [requirement(need, evidence) for need in evidence.case.requirements]
     return [*rows, *common, *(check.statement(evidence) for check in claims.acceptance)]
 
@@ -207,6 +209,7 @@ def _law(evidence: LawEvidence, on_models: bool) -> LawResult:
         own.swings,
         evidence.why_withheld if on_models else "",
         own.cold_start,
+        own.operated,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -14,6 +14,8 @@ from loopwright.pipeline.files import digest
 from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation import NOISE_SUFFIX as NOISE_SUFFIX
+from loopwright.pipeline.simulation.operator_changes import OperatedCourse, OperatorChange
+from loopwright.serving.manifest import OperateEntry
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +41,7 @@ class Scenario:
     replayed: bool = False  # a record's own course, with its noise in it: no noise is added, and no bound computed
     kind: str = ""  # of the plant gone wrong that it runs on
     dv: Array | None = None  # (n, n_dv) measured disturbances at every sample; None: they stay at the plant's own
+    operate: tuple[OperatorChange, ...] = ()  # of a law that operators steer by more than set points
 
     def __post_init__(self) -> None:
         what = f"scenario {self.name!r}"
@@ -81,6 +84,12 @@ class Scenario:
             )
         return self.dv
 
+    def operated(self, entries: Sequence[OperateEntry]) -> OperatedCourse | None:
+        """The values of these ``entries`` of a law at every sample; None where operators change nothing."""
+        if not self.operate:
+            return None
+        return OperatedCourse.of(entries, self.operate, self.samples, f"test {self.name!r}")
+
     def digest(self) -> str:
         """sha256 of what the scenario demands; seven digits, so that a solver's last bits do not count."""
 
@@ -94,6 +103,8 @@ class Scenario:
             what.append(digits(self.reference))
         if self.dv is not None:
             what.append(["dv", *digits(self.dv)])
+        if self.operate:
+            what.append([[one.at, {name: f"{v:.7g}" for name, v in one.values.items()}] for one in self.operate])
         if self.plant is not None:
             what.append([self.plant.name, *digits(self.plant.parameters())])
         return digest(what)

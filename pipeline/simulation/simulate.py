@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import isfinite
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.plants.equations import EquationPlant
@@ -68,12 +68,20 @@ def simulate_batch(plant: Simulator, x0: Array, mv: Array) -> Array:
 
 
 def simulate_closed(
-    plant: Simulator, step: Step, test: Scenario, *, noise: Sequence[float] | Array | None = None, seed: int = 0
+    plant: Simulator,
+    step: Step,
+    test: Scenario,
+    *,
+    noise: Sequence[float] | Array | None = None,
+    seed: int = 0,
+    every: Sequence[int] = (),
 ) -> Trajectory:
     """Close the loop of a controller over a plant; its measured disturbances are those of the test.
 
     ``step(sp, pv, mv_applied) -> (mv, info)``; at sample 0 ``mv_applied`` is the test's ``mv0``. ``noise`` holds
     the standard deviation of the Gaussian measurement noise of each PV, in the PV's unit; ``seed`` is its seed.
+    ``every`` (n_pv,): samples from one new reading of a PV to the next, see ``read_now``; between them the last one
+    stands. Empty: each PV is read at each sample.
 
     Raises PlantError for an unknown parameter, a wrong shape, an MV or a state that is not finite (naming the sample).
     """
@@ -86,6 +94,9 @@ def simulate_closed(
     applied = _checked("mv0", test.mv0, (n_mv,))
     for k in range(n):
         pv[k] = measure(x[k])
+        if k and every:  # what stands there is no new number
+            stands = ~read_now(every, k)
+            deviation[k, stands] = pv[k - 1, stands] + deviation[k - 1, stands] - pv[k, stands]
         move, row = step(test.sp[k], pv[k] + deviation[k], applied)
         applied = mv[k] = _checked("the controller's MV", move, (n_mv,))
         if not isfinite(sum(applied.tolist())) and not np.isfinite(applied).all():  # a finite sum is quick to see
@@ -96,6 +107,11 @@ def simulate_closed(
             _check_finite(plant, x[: k + 2])
     time_s = np.arange(n, dtype=np.float64) * plant.period_s
     return Trajectory(time_s, test.sp.copy(), pv, pv + deviation, mv, x[:-1], np.array(info).reshape(n, -1))
+
+
+def read_now(every: Sequence[int], k: int) -> NDArray[np.bool_]:
+    """Whether each PV (n_pv,) has a new reading at sample k: every ``every`` samples, and all at first."""
+    return np.array([k % n == 0 for n in every])
 
 
 def noise_draws(plant: Simulator, n: int, noise: Sequence[float] | Array | None, rng: np.random.Generator) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.plants.equations import EquationPlant, equations
 from loopwright.pipeline.plants.simulator import Array, Simulator
+from loopwright.pipeline.simulation.operator_changes import OperatorChange
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import DV_DRAW, noise_draws
 from loopwright.serving.manifest import Signal
@@ -52,6 +53,7 @@ class Timetable:
     manual: tuple[ManualSpan, ...] = ()
     marks: dict[float, str] = field(default_factory=dict)  # time [s] -> what happened there
     dv: Array | None = None  # (n, n_dv) measured disturbances; None: the plant's own
+    operate: tuple[OperatorChange, ...] = ()  # of what operators may change of the law
 
     def manual_at(self, time_s: float) -> ManualSpan | None:
         """The manual span that holds at ``time_s``."""
@@ -97,6 +99,7 @@ def timetable(
     manual: Sequence[ManualSpan] = (),
     start_cv: float | None = None,
     duration_s: float | None = None,
+    operate: Sequence[TimedValue] = (),
     seed: int = 0,
 ) -> Timetable:
     """The run that was asked for; ParamsError or PlantError names what cannot be.
@@ -116,7 +119,7 @@ def timetable(
     if set_points:
         x0, mv0, start = _rest(plant, start_cv)
         spans = [t for s in manual for t in (s.start_s, s.end_s) if math.isfinite(t)]
-        last = max([*spans, *(e.time_s for e in (*set_points, *disturbances))])
+        last = max([*spans, *(e.time_s for e in (*set_points, *disturbances, *operate))])
         n = _samples(plant, duration_s, round(last / plant.period_s) + SETTLE_SAMPLES)
         sp = np.tile(start, (n, 1))
         for i, event in sorted(moved, key=lambda e: e[1].time_s):
@@ -159,7 +162,35 @@ def timetable(
                 f"manual from {span.start_s:g} s lies beyond the run, which ends at {n * plant.period_s:g} s"
             )
         marks.setdefault(span.start_s, "manual")
-    return Timetable(plant, sp, x0, mv0, changes, *_noise(plant, noise, n, seed), tuple(manual), marks, measured)
+    changed = changes_of(operate, plant, n)
+    for change in changed:
+        if change.at:
+            text = ", ".join(f"{name} = {value:g}" for name, value in change.values.items())
+            at = change.at * plant.period_s
+            marks[at] = f"{marks[at]}, {text}" if at in marks else text
+    operated = (*(() if test is None or set_points else test.operate), *changed)
+    noises = _noise(plant, noise, n, seed)
+    return Timetable(plant, sp, x0, mv0, changes, *noises, tuple(manual), marks, measured, operated)
+
+
+def at_once(events: Sequence[TimedValue]) -> dict[str, float]:
+    """Values of ``operate`` by name; ParamsError for a name that is there twice."""
+    found: dict[str, float] = {}
+    for event in events:
+        if event.name in found:
+            raise ParamsError(
+                f"operate sets {event.name} twice, to {found[event.name]:g} and {event.value:g}; give it once"
+            )
+        found[event.name] = event.value
+    return found
+
+
+def changes_of(events: Sequence[TimedValue], plant: Simulator, n: int) -> tuple[OperatorChange, ...]:
+    """Operators' changes by sample, from events by name; ParamsError for one beyond the run, or twice at one time."""
+    found: dict[int, list[TimedValue]] = {}
+    for event in events:
+        found.setdefault(_sample(plant, event, n), []).append(event)
+    return tuple(OperatorChange(at, at_once(found[at])) for at in sorted(found))
 
 
 def _set_point(plant: Simulator, event: TimedValue) -> int:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.cases.operated_tests import check_operated
 from loopwright.pipeline.cases.own_ensemble import MEMBERS, OwnEnsemble
 from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_SET
 from loopwright.pipeline.config.exports import ExportParams, is_exported, screened_record
@@ -103,7 +104,9 @@ def _withheld(controller: str) -> str:
 
 def _case_of(name: str) -> Case:
     params = parse(CaseParams, read_section("cases", name), f"cases.{name}")
-    return choose(all_cases(), name, "case", "cases").with_held_out(params.held_out_seeds)
+    case = choose(all_cases(), name, "case", "cases")
+    check_operated(case, params.operated)
+    return case.with_held_out(params.held_out_seeds)
 
 
 def _case(name: str) -> None:

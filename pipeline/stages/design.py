@@ -23,6 +23,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.law_evidence import BASE
 from loopwright.pipeline.evaluation.model_evidence import IDENTIFIED
 from loopwright.pipeline.evaluation.proof import question, sign_doubts
+from loopwright.pipeline.export.explain_graph import export_explanation
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.files import digest, read_json, write_json
 from loopwright.pipeline.laws import LAWS, ControlLaw
@@ -38,6 +39,7 @@ from loopwright.pipeline.stages.paths import (
     model_folder,
     old_loop_file,
 )
+from loopwright.serving.explain.explain_file import explain_path
 
 REFUSALS = (PipelineError, np.linalg.LinAlgError)
 """Errors of a law that a plant does not suit; any other error is a mistake in the program."""
@@ -161,6 +163,7 @@ def _export(
     try:
         law = LAWS[params.law].design(forms[form], parts, plant.signals, plant).eval()
         export(law, path, case=params.case, provenance=origin, drive=_closed_loop(plant))
+        export_explanation(law, path)
         row = {"form": form, "seed": seed, "bytes": path.stat().st_size, "n_state": law.n_state}
         row |= _analysed(law, plant, analysis_file(params.case, params.name, form, seed))
         if withhold and form == BASE:
@@ -185,9 +188,11 @@ def _export_calmer(
         if calm is None:
             return {}
         export(calm.eval(), path, case=params.case, provenance=origin, drive=_closed_loop(plant))
+        export_explanation(calm, path)
         return {"calmed": _analysed(calm, plant, None)}
     except REFUSALS:
         path.unlink(missing_ok=True)
+        explain_path(path).unlink(missing_ok=True)
         return {}
 
 

@@ -14,6 +14,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.cases.operated_trials import try_operated
 from loopwright.pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section, sections
 from loopwright.pipeline.engine.command import run_stage
 from loopwright.pipeline.errors import LawError
@@ -49,6 +50,7 @@ from loopwright.pipeline.stages.paths import (
     validation_folder,
 )
 from loopwright.serving.controller import Controller
+from loopwright.serving.controller_file import controller_files
 
 NOTHING = "so nothing is shipped"
 REMEDY = "give the law other numbers or models, or mark the reproduction of a paper's law with `as_printed: true`"
@@ -81,7 +83,7 @@ def validate(name: str) -> None:
         withhold(ARTIFACTS / params.case / f"{params.name}.onnx", why)
         return
     seeds = sorted(
-        int(p.stem.removeprefix("seed")) for p in (design_folder(params.case, params.name) / BASE).glob("*.onnx")
+        int(p.stem.removeprefix("seed")) for p in controller_files(design_folder(params.case, params.name) / BASE)
     )
     if not seeds:
         raise LawError(f"controllers.{name} has no exported files; run its design stage first")
@@ -119,6 +121,12 @@ def validate(name: str) -> None:
     folder.mkdir(parents=True)
     models = read_json(model_folder(params.case, params.model) / "metrics.json") if case.on_models else {}
     metrics = replace(metrics, replay=_replayed(case, models, source, folder / "replay.npz"))
+    operated, loops = try_operated(
+        case, choices.noise_seed, source, choices.operated, f"validate {name}: operators' changes"
+    )
+    if operated:
+        metrics = replace(metrics, operated=operated)
+        np.savez_compressed(folder / "operated.npz", **cast(dict[str, Any], loops))
     if metrics.poor:
         why, _, remedy = metrics.poor.rpartition("; ")
         withheld = f"controllers.{name} {why}, {NOTHING}; {remedy}"
@@ -145,6 +153,8 @@ def validate(name: str) -> None:
         evidence["calmed"] = metrics.calmed
     if metrics.cold_start is not None:
         evidence["cold_start"] = asdict(metrics.cold_start)
+    if operated:
+        evidence["operated"] = {test: result.figures() for test, result in operated.items()}
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
     target = ARTIFACTS / params.case / f"{params.name}.onnx"

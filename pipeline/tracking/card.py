@@ -63,7 +63,7 @@ def version_description(
     """A version's description: verdict, signer, closed-loop evidence per scenario, analysis, picture of the loop."""
     parts = [_verdict(gate), f"<p>Signed by {escape(signed)}.</p>" if signed else "", _grounds(validation)]
     if validation is not None:
-        parts += [_table(validation, gate), _analysis(validation, gate.law)]
+        parts += [_table(validation, gate), _operated(validation, gate.law), _analysis(validation, gate.law)]
     if picture:
         alt = "Closed loop on the test that weighs most, beside the baseline of the case"
         parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
@@ -127,6 +127,21 @@ def _table(validation: Validation, shown: Gate) -> str:
             ]
         )
     return _html_table(heads, rows) if rows else ""
+
+
+def _operated(validation: Validation, law: str) -> str:
+    """A table of the tests in which operators change more than set points; nothing for a law without such tests."""
+    result = validation.laws.get(law)
+    rows = [
+        [escape(test.title), *(_percent(of) for of in (test.outside, test.late, test.gain, test.borne))]
+        for test in (result.operated if result else {}).values()
+    ]
+    heads = ["Operators' changes", "outside ranges", "in the end", "share of the gain", "borne by the last rank"]
+    return _html_table(heads, rows) if rows else ""
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.3g} %"
 
 
 def _html_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> str:

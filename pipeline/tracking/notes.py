@@ -19,6 +19,7 @@ from loopwright.pipeline.tracking.stage_results import StageResult, StageTimes, 
 
 MOST_NOTED_FIGURES = 12  # figures of a run: more would hide those that decide
 OF_A_MODEL = ("rmse", "free_run_rmse", "r2", "inside", "centres", "parameters")
+OF_AN_OPERATED_TEST = ("outside_late", "gain", "borne_by_last", "rest_miss", "profit_per_h", "optimum_per_h")
 TRACKED_POINTS = 200
 """Points of a curve; a training of thousands of iterations is thinned to these."""
 
@@ -36,7 +37,7 @@ def headline(kind: str, metrics: Mapping[str, Any], validation: Validation | Non
         "report": lambda: _of_case(validation),
     }.get(kind, dict)()
     finite = {name: float(value) for name, value in figures.items() if _is_figure(value)}
-    return dict(list(finite.items())[:MOST_NOTED_FIGURES])
+    return dict(list(finite.items())[:MOST_NOTED_FIGURES]) | (_operated(metrics) if kind == "validate" else {})
 
 
 def ratio_name(validation: Validation | None) -> str:
@@ -95,6 +96,17 @@ def _of_law(tree: Mapping[str, Any], validation: Validation | None) -> dict[str,
         "data_seeds": len(law.seeds),
     }
     return shown | _grounds(validation) | errors
+
+
+def _operated(tree: Mapping[str, Any]) -> Figures:
+    """The figures that judge a law with ``operate``, of each of its tests; none of another law."""
+    tests = LawMetrics.of(tree).operated if tree.get("operated") else {}
+    return {
+        f"operated/{test}/{name}": value
+        for test, result in tests.items()
+        for name, value in result.figures().items()
+        if name in OF_AN_OPERATED_TEST
+    }
 
 
 def _grounds(validation: Validation | None) -> dict[str, Any]:
@@ -181,6 +193,13 @@ METRICS = {
 }
 
 
+OPERATED = (
+    "`operated/…` are tests in which operators change ranges, MVs in use, costs and ranks: `outside_late` is the share"
+    " of time outside a range that a steady state keeps, in the end of the test; `gain` the share of the profit that"
+    " the best steady state would gain. Their pictures lie in the folder `operated` under Artifacts."
+)
+
+
 def _bound(validation: Validation) -> str:
     """The divisor of an error, in words."""
     gate = validation.gate
@@ -214,6 +233,8 @@ def run_note(result: StageResult, case: str, validation: Validation | None, time
     if result.kind == "report":
         parts.append("Open `report.html` under Artifacts.")
     parts.append(METRICS.get(result.kind, "").format(**words))
+    if result.kind == "validate" and validation is not None and item in validation.laws:
+        parts.append(OPERATED if validation.laws[item].operated else "")
     parts.append("All other figures: `figures.json` under Artifacts.")
     if not times.measured:
         parts.append(

@@ -28,12 +28,14 @@ from loopwright.pipeline.tracking import card, signing
 from loopwright.pipeline.tracking.gate import Gate
 from loopwright.pipeline.tracking.signing import Signer
 from loopwright.pipeline.tracking.store import missing_file
-from loopwright.serving.controller_file import manifest_in, require_sidecar
+from loopwright.serving.controller_file import EXPLAIN_SUFFIX, manifest_in, require_sidecar
 from loopwright.serving.errors import ArtifactError, SignatureError
+from loopwright.serving.explain.explain_file import explain_path
 from loopwright.serving.words import harmless, plain
 
 CANDIDATE, BEST, CHAMPION = "candidate", "best", "champion"
 BY_HAND = "champion_by"
+EXPLAINED = "explain_sha256"  # tag of a version with a graph that explains it
 REQUIREMENTS = ["onnxruntime>=1.20", "numpy>=2.0"]
 
 
@@ -87,7 +89,9 @@ def register(
     manifest = manifest_in(path.read_bytes())
     if path.with_suffix(".json").exists():
         require_sidecar(path)
-    own = {"sha256": digest, "law": law, "case": case, "period_s": str(manifest.period_s)}
+    beside = explain_path(path)  # the run of a known version has the file of then
+    explained = {EXPLAINED: sha256(beside)} if known is None and beside.is_file() else {}
+    own = {"sha256": digest, **explained, "law": law, "case": case, "period_s": str(manifest.period_s)}
     before, at = ({}, run_id) if known is None else (dict(known.tags), str(known.run_id))
     signature = signing.present(before) if signer is None else signer.attach(client, at, path, before)
     description = harmless(card.version_description(validation, gate, run_id, picture, signing.words(signature)))
@@ -282,7 +286,9 @@ def promote(client: MlflowClient, name: str, number: str, alias: str) -> str:
 def fetch(
     client: MlflowClient, what: str, folder: Path, trusted: Sequence[Path] | None = None
 ) -> tuple[list[Path], str]:
-    """Write a registered controller, its manifest and its signature into ``folder``; the files, and who signed.
+    """Write a registered controller, its manifest, its signature and the graph that explains it into ``folder``.
+
+    Returns the files, and who signed.
 
     The file is checked against its digest, and the JSON file against the manifest inside it. Where public keys are
     ``trusted``, nothing is written unless one of them signed it: whoever can write the store can write its digest too.
@@ -291,6 +297,7 @@ def fetch(
     version = _find(client, what, BEST)
     law = version.tags.get("law", "")
     suffixes = [".onnx", ".json", *([".onnx.sig"] if signing.FINGERPRINT in version.tags else [])]
+    explained = [EXPLAIN_SUFFIX] if EXPLAINED in version.tags else []
     with tempfile.TemporaryDirectory() as draft:
         files = [_download(client, version, f"{law}{suffix}", draft) for suffix in suffixes]
         if sha256(files[0]) != version.tags.get("sha256"):
@@ -303,11 +310,20 @@ def fetch(
             require_sidecar(files[0])
         except ArtifactError as error:
             raise TrackingError(f"{version.name} version {version.version}: {error}") from None
-        for file in files:
+        beside = [_download(client, version, f"{law}{suffix}", draft) for suffix in explained]
+        for file in beside:
+            if sha256(file) != version.tags[EXPLAINED]:
+                raise TrackingError(
+                    f"{version.name} version {version.version}: the stored {file.name} is not the file that was "
+                    "registered (its sha256 differs); delete the version and run `make registry`"
+                )
+        for file in (*files, *beside):
             write_bytes(folder / file.name, file.read_bytes())
+        if not beside:  # of a version that was fetched here before
+            (folder / f"{law}{EXPLAIN_SUFFIX}").unlink(missing_ok=True)
         if len(files) < 3:  # of a version that was fetched here before
             (folder / f"{files[0].name}.sig").unlink(missing_ok=True)
-        return [folder / file.name for file in files], words
+        return [folder / file.name for file in (*files, *beside)], words
 
 
 def _signer(version: ModelVersion, file: Path, trusted: Sequence[Path] | None) -> str:

@@ -215,6 +215,8 @@ def _publish_case(
             if result.key in known:
                 refresh(client, known[result.key], law, validation)
             picture = _add_picture(client, run_id, evidence.parent / "figures" / f"closed_loop_{law}.png")
+            for drawn in sorted((evidence.parent / "figures").glob(f"operated_{law}_*.png")):
+                client.log_artifact(run_id, str(drawn), "operated")
             marks = {**tags[result.name], "stage_key": result.key}
             line, is_new = register(client, case, path, run_id, validation, picture, marks, signer)
             made += is_new

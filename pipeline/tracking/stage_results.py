@@ -18,6 +18,7 @@ import yaml
 from loopwright.pipeline.engine.start import receipt_path
 from loopwright.pipeline.errors import TrackingError
 from loopwright.pipeline.files import digest
+from loopwright.serving.explain.explain_file import explain_path
 
 SLACK_S = 60.0
 """DVC may copy the outputs into its cache and back before its next stage starts."""
@@ -77,8 +78,10 @@ class StageResult:
         return sorted({path.with_suffix(".onnx") for path in beside if path.with_suffix(".onnx").is_file()})
 
     def _tops(self, root: Path) -> list[Path]:
-        """Files and folders of the outputs, and the controllers beside them."""
-        return list(dict.fromkeys([*(root / out for out in self.outs), *self.controllers(root)]))
+        """Files and folders of the outputs, the controllers beside them, and the graphs that explain these."""
+        controllers = self.controllers(root)
+        explained = [path for path in map(explain_path, controllers) if path.is_file()]
+        return list(dict.fromkeys([*(root / out for out in self.outs), *controllers, *explained]))
 
     def is_current(self, root: Path) -> bool:
         """Whether the outputs on disk are those that dvc.lock records.

@@ -15,6 +15,7 @@ from loopwright.pipeline.cases.own_model import LAW_PART
 from loopwright.pipeline.config.params import choose, parse
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.trials import close_loop
+from loopwright.pipeline.export.explain_graph import export_explanation
 from loopwright.pipeline.export.gate import export as write_controller
 from loopwright.pipeline.laws import LAWS, ControlLaw
 from loopwright.pipeline.metrics import mae, mv_travel
@@ -67,9 +68,11 @@ def design(
 def export(law: ControlLaw, path: str | Path, *, case: str = NOTEBOOK) -> Controller:
     """The law as one ONNX file, checked step by step against the law, and loaded by the runtime that will run it.
 
-    Raises ExportError where the graph differs from the law; nothing is written then.
+    Of a predictive law with ``operate`` the graph that explains it is written beside it. Raises ExportError where the
+    graph differs from the law; nothing is written then.
     """
     write_controller(law, path, case=case, provenance={})
+    export_explanation(law, path)
     return Controller(path)
 
 

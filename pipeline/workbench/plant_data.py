@@ -127,7 +127,7 @@ def screen(
         listed = with_units(controlled_first(named(given)), export)
         found = read_and_screen(export, listed)
     why = refusal(found, listed, anyway=False)
-    signals = signals_of(found.record)
+    signals = signals_of(found.record, sum(t.constraint for t in listed))
     old = [law for law in found.report.old_controllers if law.believed]
     held = {law.pv: 1 if law.kc > 0 else -1 for law in old} if len(signals.sp) == 1 else {}
     return PlantData(found.record, signals, held, found, "" if why is None else why.why)
@@ -142,9 +142,12 @@ def experiment(plant: Simulator, rows: int = 4000, seed: int = 0) -> PlantData:
     return PlantData(record, plant.signals, {})
 
 
-def signals_of(record: Record) -> Signals:
-    """The signals of a record: the first process variables have set points, as many as there are MVs for."""
-    n = min(len(record.pv_signals), len(record.mv_signals))
+def signals_of(record: Record, constraints: int = 0) -> Signals:
+    """The signals of a record: the first process variables have set points, as many as there are MVs for.
+
+    The last ones, ``constraints`` of them, have none.
+    """
+    n = min(len(record.pv_signals) - constraints, len(record.mv_signals))
     return Signals(record.period_s, record.pv_signals[:n], record.pv_signals, record.dv_signals, record.mv_signals)
 
 

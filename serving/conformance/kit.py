@@ -80,6 +80,11 @@ PASS_OF_OPERATED = (
     "and the PV's last good number, then also with its use = 0. The sample is refused where no controlled variable is "
     "left, where the law has no use of this PV, and where the PV was not read yet.",
 )
+PASS_OF_AHEAD = (
+    "given.ahead holds by how much set points and measured disturbances will differ from given.sp and given.dv: at "
+    "each of the horizon's samples one number of each signal, in the order of the manifest's ahead. All scans have "
+    "zeros.",
+)
 
 
 def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
@@ -117,7 +122,11 @@ def vectors_of(controller: Controller) -> dict[str, Any]:
             "processor": platform.machine(),
             "system": platform.system(),
         },
-        "pass": [*PASS, *(PASS_OF_OPERATED if {"operate", "fresh"} & set(m.inputs) else ())],
+        "pass": [
+            *PASS,
+            *(PASS_OF_OPERATED if {"operate", "fresh"} & set(m.inputs) else ()),
+            *(PASS_OF_AHEAD if "ahead" in m.inputs else ()),
+        ],
         "tolerance": KIT_TOLERANCE.hex(),
         "chained_tolerance": CHAIN_TOLERANCE.hex(),
         "scale": {name: written(values) for name, values in scale.items()},

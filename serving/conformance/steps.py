@@ -1,6 +1,7 @@
 """Steps of a controller for a host to repeat: from the states of a chain of 300, cold, and with inputs to refuse.
 
-A law that reads ``operate`` and ``fresh`` gets values of both that vary over the steps.
+A law that reads ``operate`` and ``fresh`` gets values of both that vary over the steps, and one that reads ``ahead``
+steps and ramps to come.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from numpy.typing import NDArray
 
 from loopwright.serving.controller import Controller, Step
 from loopwright.serving.errors import OutputError, SampleError
-from loopwright.serving.manifest import SWITCHES, Manifest, Signal
+from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.operating import Operate
+from loopwright.serving.preview.ahead import AheadInput
+from loopwright.serving.preview.differences import Differences
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -30,6 +33,8 @@ AT_AN_END = 0.1  # share of the values drawn anywhere that lie at an end of the 
 STEERED = 0.5  # share of the entries of `operate` that are not the default: at all others a loop would hardly move
 STEERED_ANEW = 0.1  # probability a step of a course that operators change something
 UNFRESH = 0.2  # share of the readings that are not fresh
+NOTHING_TO_COME = 0.2  # share of the steps whose `ahead` is zeros, as of a host that gives none
+STEPPED = 0.5  # share of the signals that step within the horizon; the others run straight
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +44,7 @@ class StepInputs:
     part: str
     inputs: dict[
         str, Array
-    ]  # sp (n_sp,), pv (n_pv,), dv (n_dv,), mv_applied (n_mv,); operate, fresh where they are read
+    ]  # sp (n_sp,), pv (n_pv,), dv (n_dv,), mv_applied (n_mv,); operate, fresh, ahead where they are read
     cold: bool = False
 
 
@@ -178,28 +183,33 @@ class _Steering:
 
     manifest: Manifest
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(3))
+    known: np.random.Generator = field(default_factory=lambda: np.random.default_rng(4))
     at: Array | None = None
 
     def joined(self, given: StepInputs) -> StepInputs:
         """``given`` and the values of its step."""
+        if "ahead" in self.manifest.inputs and self.manifest.ahead is not None:
+            given = replace(given, inputs=given.inputs | {"ahead": self._to_come(self.manifest.ahead, given)})
         if not {"operate", "fresh"} & set(self.manifest.inputs):
             return given
         if self.at is None:
             self.at = np.array(self.manifest.usual("operate"))
         elif given.part in WITHOUT_PAST or self.rng.uniform() < STEERED_ANEW:
-            self.at = self._drawn()
+            self.at = Operate(self.manifest.operate).drawn(self.rng, STEERED)
         fresh = (self.rng.uniform(size=len(self.manifest.pv)) >= UNFRESH).astype(np.float64)
         values = {"operate": self.at, "fresh": fresh}
         return replace(given, inputs=given.inputs | {n: v for n, v in values.items() if n in self.manifest.inputs})
 
-    def _drawn(self) -> Array:
-        """Values within the engineered ranges: switches 0 or 1, ranks whole, no low end above its high one."""
-        found = np.array(self.manifest.usual("operate"))
-        for i, e in enumerate(self.manifest.operate):
-            if self.rng.uniform() < STEERED:
-                whole = e.what in SWITCHES or e.what == "rank"
-                found[i] = self.rng.integers(int(e.low), int(e.high) + 1) if whole else self.rng.uniform(e.low, e.high)
-        return Operate(self.manifest.operate).ordered(found)
+    def _to_come(self, ahead: AheadInput, given: StepInputs) -> Array:
+        """Set points and disturbances that step or run straight to a value within their ranges; zeros by and by."""
+        rng, n = self.known, len(ahead.signals)
+        present = np.concatenate([given.inputs["sp"], given.inputs["dv"]])
+        present = np.where(np.isfinite(present), present, 0.0)  # of a step that is refused for it
+        target = np.array([rng.uniform(s.low, s.high) for s in ahead.signals])
+        at, begin = np.arange(1, ahead.horizon + 1)[:, None], rng.integers(1, ahead.horizon + 1, n)
+        share = np.where(rng.uniform(size=n) < STEPPED, at >= begin, at / ahead.horizon)
+        change = share * (target - present) * (rng.uniform() >= NOTHING_TO_COME)
+        return Differences(ahead).within(change, present)
 
 
 def _anywhere(rng: np.random.Generator, signals: tuple[Signal, ...]) -> Array:

@@ -237,6 +237,11 @@ class JournalReader:
         row = self._base.execute("select value from learnt where name = ?", (name,)).fetchone()
         return None if row is None else str(row[0])
 
+    def learnt_names(self, begin: str) -> list[str]:
+        """The names that begin so, in order, under which a text was kept."""
+        rows = self._base.execute("select name from learnt where substr(name, 1, ?) = ?", (len(begin), begin))
+        return sorted(str(name) for (name,) in rows)
+
     def events(self, after_id: int = 0, begin_s: float = -1e300, end_s: float = 1e300) -> list[tuple[int, EventEntry]]:
         """(id, event) after an id and within times, in order."""
         rows = self._base.execute(

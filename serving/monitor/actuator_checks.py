@@ -50,14 +50,20 @@ class ActuatorFaults:
         self._last: list[float] | None = None
         self._last_move = [0.0] * n
 
-    def add(self, mv: Array, error: float, time_s: float) -> None:
-        """The MVs (n_mv,) of a scan, the largest error as a share of its range, and when that was [s since 1970]."""
+    def add(self, mv: Array, error: float, time_s: float, moved: Sequence[bool] | None = None) -> None:
+        """The MVs (n_mv,) of a scan, the largest error as a share of its range, and when that was [s since 1970].
+
+        ``moved`` (n_mv,) are those that the law may move; None: all. One that it may not is no fault where it stands.
+        """
         first, far = self._last is None, error > FAR_ERROR
         self._count += not first
         weight = 1 / min(max(self._count, 1), MEMORY)
         shares = ((mv - self._low) / self._span).tolist()
         for i, share in enumerate(shares):  # a loop over one or two is faster than a dozen calls of numpy
             end = 1.0 if share >= 1 - ACTUATOR_AT_END else -1.0 if share <= ACTUATOR_AT_END else 0.0
+            if moved is not None and not moved[i]:
+                self._rests(i, time_s)
+                continue
             if far and end and end == self.end[i]:
                 self.stuck[i] += 1
             else:
@@ -69,6 +75,10 @@ class ActuatorFaults:
                 self.move[i] += (abs(move) - self.move[i]) * weight
                 self._last_move[i] = move
         self._last = shares
+
+    def _rests(self, i: int, time_s: float) -> None:
+        """The law does not move this MV: what it does is no fault of the loop's."""
+        self.stuck[i], self.end[i], self.since_s[i], self._last_move[i] = 0, 0.0, time_s, 0.0
 
     def jammed(self, i: int) -> bool:
         """Whether an MV has stayed at its end for too long."""
@@ -124,10 +134,13 @@ class Following:
         self._came = [False] * n  # whether it has moved
         self.away, self.pushed, self._side = [0] * n, [0] * n, [0.0] * n  # scans, scans, sign
 
-    def add(self, applied: Array, command: Array, error: float | None, time_s: float) -> None:
+    def add(
+        self, applied: Array, command: Array, error: float | None, time_s: float, moved: Sequence[bool] | None = None
+    ) -> None:
         """A scan: read-backs (n_mv,), the commands before it (n_mv,), the largest error as a share of its range.
 
-        ``error`` is None where no law is to remove it. ``time_s`` is when that was [s since 1970].
+        ``error`` is None where no law is to remove it. ``time_s`` is when that was [s since 1970]. ``moved`` (n_mv,)
+        are the MVs that somebody commands; None: all. An actuator that is left to others follows no command.
         """
         read = ((applied - self._low) / self._span).tolist()
         asked = ((command - self._low) / self._span).tolist()
@@ -138,6 +151,10 @@ class Following:
         for i, (r, c) in enumerate(zip(read, asked, strict=True)):
             self._rested[i] = self._rested[i] + 1 if c == self._last[i] else 0
             self._last[i] = c
+            if moved is not None and not moved[i]:
+                self._stood[i], self._from[i], self.since_s[i] = r, c, time_s
+                self._came[i], self.away[i], self.pushed[i], self._side[i] = False, 0, 0, 0.0
+                continue
             if abs(r - self._stood[i]) > STILL_READ_BACK:
                 self._stood[i], self._from[i], self.since_s[i] = r, c, time_s
                 self._came[i], self.away[i], self.pushed[i] = True, 0, 0

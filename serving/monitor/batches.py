@@ -66,8 +66,8 @@ class BatchMeans(KeepsState):
         """Whether the plant makes batches at all."""
         return self.alike >= ALIKE_BATCHES
 
-    def add(self, sample: tuple[Array, Array, Array, Array | None], time_s: float) -> None:
-        """One scan: set points, PVs, MVs, info."""
+    def add(self, sample: tuple[Array, Array, Array, Array | None], time_s: float, fresh: Array | None = None) -> None:
+        """One scan: set points, PVs, MVs, info; ``fresh`` (n_pv,) is 1 for new readings, None: all are."""
         sp, pv, mv, info = sample
         self.scans += 1
         if not self.length:
@@ -82,7 +82,7 @@ class BatchMeans(KeepsState):
         )
         self.sums[part] += np.concatenate(shares)
         self.counts[part] += 1
-        self.answers.add(pv, mv, None, time_s)
+        self.answers.add(pv, mv, None, time_s, fresh)
 
     def end(self, time_s: float) -> None:
         """The end of a stretch in AUTO."""

@@ -33,6 +33,7 @@ class KeepsState:
     """
 
     KEPT: ClassVar[Kept] = {}
+    LATER: ClassVar[frozenset[str]] = frozenset()  # that a memory of an older release has not: they stay as they are
 
     def memory(self) -> dict[str, Any]:
         """The attributes, JSON-ready."""
@@ -43,6 +44,8 @@ class KeepsState:
         if not isinstance(memory, dict):
             raise ValueError(f"{_shown(memory)} in place of what a {type(self).__name__} keeps")
         for name, within in self.KEPT.items():
+            if name not in memory and name in self.LATER:
+                continue
             if name not in memory:
                 raise ValueError(f"{name} is missing")
             setattr(self, name, _in(getattr(self, name), memory[name], name, within))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import exp
-from typing import ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,11 @@ LEAST_SQUARE = 1e-18  # of a range: the error of a plant without noise
 MOST_LOG = 700.0  # whose exponential is still a number
 
 
-def log_mean_square(sums: Array, count: int) -> Array:
-    """log(sums / count) of the sums (n,) of the squares of ``count`` errors, which are shares of their ranges."""
+def log_mean_square(sums: Array, count: int | Array) -> Array:
+    """log(sums / count) of the sums (n,) of the squares of ``count`` errors, which are shares of their ranges.
+
+    ``count`` is one for all, or (n,).
+    """
     return np.asarray(np.log(sums / count + LEAST_SQUARE))
 
 
@@ -67,15 +70,21 @@ class OnlineArx(KeepsState):
         """The samples before a gap say nothing of the next."""
         self._filled = 0
 
-    def add(self, pv: Array, mv: Array) -> tuple[Array, Array] | None:
-        """One scan: (phi of the scan before, errors (n_pv,) of what it foresaw); None right after a gap."""
+    def add(self, pv: Array, mv: Array, fresh: Array | None = None) -> tuple[Array, Array] | None:
+        """One scan: (phi of the scan before, errors (n_pv,) of what it foresaw); None right after a gap.
+
+        ``fresh`` (n_pv,), 1 or 0, says which numbers are new readings; None: all are. The others stand in for what is
+        not known, and have no error.
+        """
         y, past = (pv - self._low_y) / self._span_y, self._past
         told = None
         if self._filled >= PAST_MV:
             error = y - past @ self.theta
+            if fresh is not None:
+                error = error * fresh
             told = past, error
             if not self.frozen:
-                self._learn(past, error)
+                self._learn(past, error, fresh)
         first = PAST_PV * self.n_y
         self._past = past[self._older]
         self._past[: self.n_y] = y
@@ -95,14 +104,15 @@ class OnlineArx(KeepsState):
             self._basis = vectors * np.sqrt(np.maximum(values, 1e-12))
         return self._basis
 
-    def _learn(self, phi: Array, error: Array) -> None:
+    def _learn(self, phi: Array, error: Array, fresh: Array | None) -> None:
         p_phi = self.p @ phi
         gain = (p_phi / (1.0 + phi @ p_phi))[:, None]
         self.theta = self.theta + gain * error
         self.p = self.p - gain * p_phi
         self.scans += 1
         # Errors of a model that is still wild say nothing of its noise.
-        self.square = self.square + (error**2 - self.square) / max(min(self.scans, SQUARES), 20)
+        change = (error**2 - self.square) / max(min(self.scans, SQUARES), 20)
+        self.square = self.square + (change if fresh is None else change * fresh)
 
 
 def ranges(signals: Sequence[Signal]) -> tuple[Array, Array]:
@@ -120,7 +130,8 @@ class Foresight(KeepsState):
     The logarithm of each block's mean square goes into a chart upwards. ``told``: whether the law tells it at all.
     """
 
-    KEPT: ClassVar[Kept] = {"sums": SIZE_RANGE, "count": COUNT, "chart": ANY}
+    KEPT: ClassVar[Kept] = {"sums": SIZE_RANGE, "count": COUNT, "chart": ANY, "readings": COUNT}
+    LATER = frozenset({"readings"})
 
     def __init__(self, manifest: Manifest, *, block: int, learn: int, weekly: float, rate: float) -> None:
         m = manifest
@@ -130,7 +141,7 @@ class Foresight(KeepsState):
         self.told = bool(self._places)
         self.block = block
         self._span = ranges(m.pv)[1][:n_cv]
-        self.sums, self.count = np.zeros(n_cv), 0
+        self.sums, self.count, self.readings = np.zeros(n_cv), 0, np.zeros(n_cv)  # readings: new ones of each
         self.chart = Chart(n_cv, learn, weekly=weekly, rate=rate / n_cv, least=LEAST_SIGMA, both=False)
         self._expected: Array | None = None
 
@@ -138,18 +149,31 @@ class Foresight(KeepsState):
         """The samples before a gap say nothing of the next."""
         self._expected = None
 
-    def add(self, pv: Array, info: Array | None, time_s: float) -> Array | None:
-        """One scan: PVs (n_pv,) and the law's info. The errors (n_cv,) of what it expected, of their ranges."""
+    def recall(self, memory: Any) -> None:
+        """Take them back; of an older release, which counted no readings, without its present block."""
+        super().recall(memory)
+        if "readings" not in memory:
+            self.sums, self.count = np.zeros(self.n_cv), 0
+
+    def add(self, pv: Array, info: Array | None, time_s: float, fresh: Array | None = None) -> Array | None:
+        """One scan: PVs (n_pv,) and the law's info. The errors (n_cv,) of what it expected, of their ranges.
+
+        Those without a new reading (``fresh`` (n_pv,) 0) have none. A block that has no reading of a variable goes on;
+        once it has learnt, such a variable counts as what it was at first.
+        """
         if not self.told:
             return None
         error = None
         if self._expected is not None:
-            error = (pv[: self.n_cv] - self._expected) / self._span
+            new = np.ones(self.n_cv) if fresh is None else fresh[: self.n_cv]
+            error = new * (pv[: self.n_cv] - self._expected) / self._span
             self.sums = self.sums + error**2
             self.count += 1
-            if self.count >= self.block:
-                self.chart.add(log_mean_square(self.sums, self.count), time_s)
-                self.sums, self.count = np.zeros(self.n_cv), 0
+            self.readings = self.readings + new
+            if self.count >= self.block and (self.readings.all() or self.chart.learnt):
+                figures = log_mean_square(self.sums, np.maximum(self.readings, 1.0))
+                self.chart.add(np.where(self.readings > 0, figures, self.chart.mean), time_s)
+                self.sums, self.count, self.readings = np.zeros(self.n_cv), 0, np.zeros(self.n_cv)
         self._expected = None if info is None else info[self._places]
         return error
 
@@ -194,9 +218,9 @@ class Swing(KeepsState):
         self.intervals: list[int] = []
         self.amplitudes: list[float] = []
 
-    def add(self, error: float) -> None:
-        """One scan."""
-        self.since += 1
+    def add(self, error: float, scans: int = 1) -> None:
+        """One reading, ``scans`` scans after the one before it."""
+        self.since += scans
         self.largest = max(self.largest, abs(error))
         side = 1 if error > self.band else -1 if error < -self.band else 0
         if side and side != self.side:

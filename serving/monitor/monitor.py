@@ -16,6 +16,7 @@ from loopwright.serving.manifest import Manifest
 from loopwright.serving.monitor.actuator_checks import ACTUATOR_AT_END, ActuatorFaults, Following
 from loopwright.serving.monitor.batches import BatchMeans
 from loopwright.serving.monitor.cusum import (
+    ANY,
     DAY_S,
     TIME_S,
     WEEK_S,
@@ -28,6 +29,7 @@ from loopwright.serving.monitor.cusum import (
 )
 from loopwright.serving.monitor.loop_statistics import Estimates, Foresight, Share, Swing, harris_index, log_mean_square
 from loopwright.serving.monitor.plant_drift import Answers, RestMap
+from loopwright.serving.monitor.signal_use import SignalUse, UseOfSignals
 from loopwright.serving.monitor.verdicts import Verdict, failed, verdicts
 
 
@@ -65,15 +67,19 @@ LEAST_DAY, MOST_DAY = 2_000, 200_000  # scans over which a share is taken
 SWING_BAND = 0.005  # of a set point's range: smaller errors are no swing
 HARRIS_SCANS = 500  # scans that Harris's index is taken from
 NEAR_REST = 0.02  # of a set point's range: a mean error beyond is no rest
+LEAST_READINGS = 3  # of each variable in a period of rest: a slow analyser makes it longer
 
 
 class Monitor:
     """Watches one controller in its loop.
 
-    ``observe`` takes a scan: bounded work and memory, and no content of it raises. The loop's settling time in the
-    validation (the evidence's ``settling``, else ``SETTLE_SCANS``) says how long a period of rest is. It learns the
-    normal from the first periods in AUTO; ``loopwright.serving.monitor.verdicts`` says what each figure is held
-    against.
+    ``observe`` takes a scan: bounded work and memory, and no content of it raises. Only new and good readings count. A
+    controlled variable that operators have out of use, or within a range alone, has no error from its set point, and
+    an MV that they have out of use no fault. Rests are those of the ``operate`` with which it began.
+
+    The loop's settling time in the validation (the evidence's ``settling``, else ``SETTLE_SCANS``) says how long a
+    period of rest is. It learns the normal from the first periods in AUTO; ``loopwright.serving.monitor.verdicts`` says
+    what each figure is held against.
 
     Parameters
     ----------
@@ -114,6 +120,10 @@ class Monitor:
         self._commanded: Array | None = None  # at the scan before, where it was written
         self.harris = [Share(1, 20) for _ in m.sp]
         self.first_answers = answer_scans(m)
+        self.use = UseOfSignals(m)
+        self._taste: tuple[float, ...] | None = None  # the values of ``operate`` that move rests, as it began
+        self._held = np.full(len(m.pv), np.nan)  # the last good reading of each PV
+        self._silent = [0] * len(m.sp)  # scans since each was read
         self._window = [deque[float](maxlen=HARRIS_SCANS) for _ in m.sp]
         self.domain = m.info.index("in_domain") if "in_domain" in m.info else None
         self._mv_low = np.array([s.low for s in m.mv])
@@ -121,6 +131,8 @@ class Monitor:
         self._sp_span = np.array([s.high - s.low for s in m.sp])
         self._span: list[float] = self._sp_span.tolist()
         self.max_move = [inf if s.max_move is None else 0.999 * s.max_move / (s.high - s.low) for s in m.mv]
+        pv_spans = [s.high - s.low for s in m.pv]
+        self._error_span = [*self._span, *pv_spans[len(self._span) :]]
         self._sp: list[float] | None = None
         self._last: list[float] | None = None  # the MVs of the scan before, as shares of their ranges
         self._still = 0  # scans since the set points moved or the loop left AUTO
@@ -134,48 +146,88 @@ class Monitor:
         return self.foresight if self.foresight.told else self.answers
 
     # ------------------------------------------------------------------ a scan
-    def observe(self, time_s: float, sample: Sample | None, command: Command) -> None:
-        """One scan, at ``time_s`` [s since 1970]."""
+    def observe(self, time_s: float, sample: Sample | None, command: Command, operate: Array | None = None) -> None:
+        """One scan, at ``time_s`` [s since 1970]; ``operate`` (n_operate,) is what operators want, None: defaults."""
         try:
-            self._observe(time_s, sample, command)
+            self._observe(time_s, sample, command, self.use.of(sample, command, operate))
         except Exception as error:  # the loop goes on, whatever fails here
             self.trouble = f"{type(error).__name__}: {error}"
             self._gap()
 
-    def _observe(self, time_s: float, sample: Sample | None, command: Command) -> None:
-        self._follow(time_s, sample, command)
+    def _observe(self, time_s: float, sample: Sample | None, command: Command, use: SignalUse) -> None:
+        lawful = sample is not None and command.mode is Mode.AUTO and command.law_mv is not None
+        pv = self._readings(sample, use) if sample is not None and lawful else None
+        errors = None if pv is None else use.errors(pv.tolist(), command.sp.tolist())
+        self._follow(time_s, sample, command, None if errors is None else self._largest(errors), use)
         if command.mode is not Mode.SHADOW:
             self.hold.add(float(command.mode is Mode.HOLD))
-        apart = _without_reading(sample, command)  # a law that goes on without a reading is no measure of itself
-        if sample is None or command.mode is not Mode.AUTO or command.law_mv is None or apart:
+        if pv is None or errors is None:
             if command.mode in {Mode.SHADOW, Mode.MANUAL}:  # a batch's end; a fault is none
                 self.batches.end(time_s)
             self._gap()
             return
-        pv, mv = np.asarray(sample.pv, dtype=np.float64), command.mv
-        sp = command.sp.tolist()
-        errors = [value - at for value, at in zip(pv.tolist(), sp, strict=False)]  # the first PVs are controlled
+        mv, sp = command.mv, command.sp.tolist()
         shares = ((mv - self._mv_low) / self._mv_span).tolist()
         if not isfinite(sum(errors) + sum(shares)):
             self._gap()
             return
-        saturated = self._shares(shares, command)
-        off = [abs(e) / span for e, span in zip(errors, self._span, strict=True)]
-        for value, share, mean, swing in zip(errors, off, self.errors, self.swings, strict=True):
-            mean.add(share)
-            swing.add(value)
-        self.actuators.add(mv, max(off), time_s)
-        missed = self.foresight.add(pv, command.info, time_s)
-        self.answers.add(pv, mv, missed, time_s)
-        self.estimates.add(command.info, time_s)
-        self.batches.add((command.sp, pv, mv, command.info), time_s)
+        saturated = self._shares(shares, command, use)
+        self._errors(errors, use)
+        self.actuators.add(mv, self._largest(errors), time_s, use.moved)
+        fresh = None if all(use.fresh) else np.array(use.fresh, dtype=np.float64)
+        missed = self.foresight.add(pv, command.info, time_s, fresh)
+        self.answers.add(pv, mv, missed, time_s, fresh)
+        if not (command.bridged or command.shed):  # what it corrects stands still while a reading is bad
+            self.estimates.add(command.info, time_s)
+        self.batches.add((command.sp, pv, mv, command.info), time_s, fresh)
         if sp != self._sp:
             self._moved(sp)
         self._still += 1
+        if self._taste is None:
+            self._taste = use.taste
+        if use.taste != self._taste or self._bound(mv, pv, use):
+            self._still = 0
+            self._clear()
         if self._still > 2 * self.settle:
-            self._rest(time_s, errors, mv, saturated)
+            self._rest(time_s, errors, mv, saturated, use)
 
-    def _follow(self, time_s: float, sample: Sample | None, command: Command) -> None:
+    def _readings(self, sample: Sample, use: SignalUse) -> Array | None:
+        """The PVs (n_pv,), the last good one where there is no new one; None as long as one has not been read."""
+        pv = np.asarray(sample.pv, dtype=np.float64)
+        if not all(use.fresh):
+            pv = np.where(use.fresh, pv, self._held)
+        self._held = pv
+        return pv if np.isfinite(pv).all() else None
+
+    def _largest(self, errors: list[float]) -> float:
+        """The largest error, as a share of the range of its set point or PV."""
+        return float(max(abs(e) / span for e, span in zip(errors, self._error_span, strict=True)))
+
+    def _errors(self, errors: list[float], use: SignalUse) -> None:
+        """Errors from set points that are wanted, at new readings."""
+        for i, (mean, swing) in enumerate(zip(self.errors, self.swings, strict=True)):
+            self._silent[i] += 1
+            if not use.tracked[i]:
+                swing.forget()
+                self._silent[i] = 0
+            elif use.fresh[i]:
+                mean.add(abs(errors[i]) / self._span[i])
+                swing.add(errors[i], self._silent[i])
+                self._silent[i] = 0
+
+    def _bound(self, mv: Array, pv: Array, use: SignalUse) -> bool:
+        """Whether operators' limits or ranges decide where the plant rests: then set points do not."""
+        near = ACTUATOR_AT_END * self._mv_span
+        low, high = self._mv_low + near, self._mv_low + self._mv_span - near  # the engineered ends are ``saturated``
+        limits = zip(mv.tolist(), use.mv_low, use.mv_high, low.tolist(), high.tolist(), near.tolist(), strict=True)
+        if any((a > low and at <= a + by) or (b < high and at >= b - by) for at, a, b, low, high, by in limits):
+            return True
+        ranges = zip(pv.tolist(), use.used, use.low, use.high, strict=True)
+        return any(used and not low < value < high for value, used, low, high in ranges)
+
+    def _follow(
+        self, time_s: float, sample: Sample | None, command: Command, error: float | None, use: SignalUse
+    ) -> None:
         """Compare the read-back with the command before, in each mode that writes; a fault says nothing of it."""
         before, self._commanded = self._commanded, None
         if sample is None or sample.mv_applied is None or command.fault or not command.writes:
@@ -185,14 +237,12 @@ class Monitor:
         applied = np.asarray(sample.mv_applied, dtype=np.float64)
         if before is None or applied.shape != before.shape or not np.isfinite(applied).all():
             return
-        error = None
-        if command.mode is Mode.AUTO and not _without_reading(sample, command):
-            off = np.abs(np.asarray(sample.pv, dtype=np.float64)[: len(command.sp)] - command.sp) / self._sp_span
-            error = float(off.max())
-        self.following.add(applied, before, error, time_s)
+        moved = use.moved if command.mode is Mode.AUTO else None
+        self.following.add(applied, before, error, time_s, moved)
 
-    def _shares(self, shares: list[float], command: Command) -> bool:
-        saturated = any(s <= ACTUATOR_AT_END or s >= 1 - ACTUATOR_AT_END for s in shares)
+    def _shares(self, shares: list[float], command: Command, use: SignalUse) -> bool:
+        ends = zip(shares, use.moved, strict=True)
+        saturated = any(moved and (s <= ACTUATOR_AT_END or s >= 1 - ACTUATOR_AT_END) for s, moved in ends)
         self.saturated.add(float(saturated))
         if self._last is not None:
             moves = zip(shares, self._last, self.max_move, strict=True)
@@ -212,22 +262,28 @@ class Monitor:
         self._sp, self._still = sp, 0
         self._clear()
 
-    def _rest(self, time_s: float, errors: list[float], mv: Array, saturated: bool) -> None:
+    def _rest(self, time_s: float, errors: list[float], mv: Array, saturated: bool, use: SignalUse) -> None:
         """A scan at set points that stand still; a period of rest is whole after ``settle`` of them."""
         self._n += 1
-        error = np.array(errors)
+        n_sp = len(self._span)
+        new = np.array(use.fresh[:n_sp], dtype=np.float64)
+        error = new * np.array(errors[:n_sp])
+        self._readings_of += new
         self._mv_sum += mv
         self._e_sum += error
         self._e2_sum += error * error
         self._ends += saturated
-        for window, value in zip(self._window, errors, strict=True):
-            window.append(value)
-        if self._n < self.settle:
+        for window, value, is_new in zip(self._window, errors[:n_sp], use.fresh[:n_sp], strict=True):
+            if is_new:
+                window.append(value)
+            else:
+                window.clear()  # its index is of readings at each scan
+        if self._n < self.settle or (self._readings_of < LEAST_READINGS).any():
             return
-        mean = self._e_sum / self._n
+        mean = self._e_sum / self._readings_of
         if not self._ends and (np.abs(mean) <= NEAR_REST * self._sp_span).all():
             self.rest.add(np.array(self._sp), self._mv_sum / self._n, time_s)
-        self.spread.add(log_mean_square(self._e2_sum / self._sp_span**2, self._n), time_s)
+        self.spread.add(log_mean_square(self._e2_sum / self._sp_span**2, self._readings_of), time_s)
         for i, window in enumerate(self._window):
             if len(window) == HARRIS_SCANS:
                 self.harris[i].add(harris_index(np.array(window), self.first_answers[i]))
@@ -246,12 +302,14 @@ class Monitor:
         self.batches.forget()
         self.actuators.forget()
         self._steady()
+        self._silent = [0] * len(self._span)
         self._sp = self._last = None
         self._still = 0
         self._clear()
 
     def _clear(self) -> None:
         self._n = self._ends = 0
+        self._readings_of = np.zeros(len(self.manifest.sp))
         self._mv_sum = np.zeros(len(self.manifest.mv))
         self._e_sum, self._e2_sum = np.zeros(len(self.manifest.sp)), np.zeros(len(self.manifest.sp))
 
@@ -297,6 +355,7 @@ class Monitor:
             "law": self.manifest.law,
             "settle": self.settle,
             "started_s": self.started_s,
+            "taste": None if self._taste is None else list(self._taste),
             "parts": {n: [p.memory() for p in v] if isinstance(v, list) else v.memory() for n, v in parts.items()},
         }
 
@@ -317,6 +376,11 @@ class Monitor:
                 raise ValueError(f"what was learnt of {name} is not of {len(part)} signals")
             for one, memory in zip(part, kept, strict=True):
                 one.recall(memory)
+        taste = state.get("taste")
+        if taste is not None:
+            if not isinstance(taste, list):
+                raise ValueError("the values of operate with which it began are no list of numbers")
+            made._taste = tuple(number(v, "taste", ANY) for v in taste)
         made._tried()
         return made
 
@@ -332,9 +396,3 @@ class Monitor:
 
 def _finite(value: float | None) -> float | None:
     return value if value is None or isfinite(value) else None
-
-
-def _without_reading(sample: Sample | None, command: Command) -> bool:
-    """Whether a PV of this scan has no new and good reading."""
-    old = sample is not None and sample.fresh is not None and not np.all(sample.fresh)
-    return old or bool(command.bridged or command.shed)

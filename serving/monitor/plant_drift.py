@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +141,9 @@ class Answers(KeepsState):
         "scores": ANY,
         "sizes": ANY,
         "shapes": ANY,
+        "readings": COUNT,
     }
+    LATER = frozenset({"readings"})
 
     def __init__(
         self, manifest: Manifest, *, block: int, model: int, learn: int, weekly: float, rate: float, told: bool = False
@@ -153,8 +155,15 @@ class Answers(KeepsState):
         self.told_square = np.zeros(self.n_told)  # mean square of the law's errors while the model learnt
         self.blocks, self.count = 0, 0
         self.squares, self.scores = np.zeros(n_y), np.zeros((n_phi, n_y))
+        self.readings = np.zeros(n_y)  # new ones of each error
         self.sizes = Chart(n_y, learn, weekly=weekly, rate=rate / 2 / n_y, least=LEAST_SIGMA, both=False)
         self.shapes = Chart(n_phi * n_y, learn, weekly=weekly, rate=rate / 2 / n_phi / n_y, least=LEAST_SCORE)
+
+    def recall(self, memory: Any) -> None:
+        """Take them back; of an older release, which counted no readings, without its present block."""
+        super().recall(memory)
+        if "readings" not in memory:
+            self.drop()
 
     @property
     def learnt(self) -> bool:
@@ -171,9 +180,12 @@ class Answers(KeepsState):
         """The samples before a gap say nothing of the next."""
         self.model.forget()
 
-    def add(self, pv: Array, mv: Array, error: Array | None, time_s: float) -> None:
-        """One scan: PVs (n_pv,), the MV that goes to the plant now (n_mv,), the error of the law's own prediction."""
-        found = self.model.add(pv, mv)
+    def add(self, pv: Array, mv: Array, error: Array | None, time_s: float, fresh: Array | None = None) -> None:
+        """One scan: PVs (n_pv,), the MV that goes to the plant now (n_mv,), the error of the law's own prediction.
+
+        PVs without a new reading (``fresh`` (n_pv,) 0) have no error; what stands for them is their last reading.
+        """
+        found = self.model.add(pv, mv, fresh)
         if found is None or (self.n_told and error is None):
             return
         self.count += 1
@@ -183,14 +195,18 @@ class Answers(KeepsState):
             errors = errors if told is None else np.concatenate([errors, told])
             self.squares = self.squares + errors**2
             self.scores = self.scores + phi[:, None] * errors
+            new = np.ones(self.model.n_y) if fresh is None else fresh
+            self.readings = self.readings + np.concatenate([new, new[: self.n_told]])
         elif told is not None:
-            self.told_square = self.told_square + (told**2 - self.told_square) / min(self.model.scans, SQUARES)
-        if self.count >= self.block:
+            change = (told**2 - self.told_square) / min(self.model.scans, SQUARES)
+            self.told_square = self.told_square + (change if fresh is None else change * fresh[: self.n_told])
+        whole = not self.model.frozen or self.readings.all() or self.learnt
+        if self.count >= self.block and whole:
             self.end(time_s, 1)
 
     def end(self, time_s: float, least: int) -> None:
-        """The end of a block; one of fewer than ``least`` scans is not judged."""
-        if self.count >= least:
+        """The end of a block; one of fewer than ``least`` scans is not judged, nor learnt without all readings."""
+        if self.count >= least and (not self.model.frozen or self.readings.all() or self.learnt):
             self.blocks += 1
             if not self.model.frozen:
                 if self.blocks >= self.model_blocks:
@@ -198,14 +214,17 @@ class Answers(KeepsState):
             else:
                 squares = np.concatenate([self.model.square, self.told_square])
                 sigma = np.sqrt(np.maximum(squares, 1e-18))
-                scores = self.model.basis.T @ self.scores / (sigma * np.sqrt(self.count))
-                self.sizes.add(log_mean_square(self.squares, self.count), time_s)
-                self.shapes.add(scores.T.ravel(), time_s)
+                count, seen = np.maximum(self.readings, 1.0), self.readings > 0  # of the unseen: as at first
+                scores = self.model.basis.T @ self.scores / (sigma * np.sqrt(count))
+                self.sizes.add(np.where(seen, log_mean_square(self.squares, count), self.sizes.mean), time_s)
+                shapes = np.where(np.repeat(seen, self.model.n_phi), scores.T.ravel(), self.shapes.mean)
+                self.shapes.add(shapes, time_s)
         self.drop()
 
     def drop(self) -> None:
         """Leave the present block out."""
         self.count, self.squares, self.scores = 0, np.zeros_like(self.squares), np.zeros_like(self.scores)
+        self.readings = np.zeros_like(self.readings)
 
     def ratio(self, i: int) -> float:
         """The root mean square error of PV ``i`` of late over that of the time in which it learnt."""

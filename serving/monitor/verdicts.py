@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
-from loopwright.serving.manifest import Signal
+from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.monitor.batches import BATCH_PARTS
 from loopwright.serving.monitor.loop_statistics import Foresight, rms_ratio
 
@@ -232,7 +232,7 @@ def _variability(m: Monitor) -> list[Verdict]:
     found = []
     for i, s in enumerate(m.manifest.sp):
         name, drift, span = f"error of {s.name}", m.spread, s.high - s.low
-        worst = _worst_validated(m)
+        worst = worst_validated(m.manifest)
         mean = m.errors[i].value * span
         whole = m.errors[i].count >= m.errors[i].memory_scans  # a day: one move of the set point is no measure
         if worst is not None and len(m.manifest.sp) == 1 and whole and mean > WORSE_ERROR * worst:
@@ -297,9 +297,9 @@ def _shares(m: Monitor) -> list[Verdict]:
     return found
 
 
-def _worst_validated(m: Monitor) -> float | None:
+def worst_validated(m: Manifest) -> float | None:
     """The largest mean error of the validation's noisy tests."""
-    rows = m.manifest.evidence.get("scenarios")
+    rows = m.evidence.get("scenarios")
     if not isinstance(rows, dict):
         return None
     found = [row.get("mae") for name, row in rows.items() if isinstance(row, dict) and name.endswith("_noise")]

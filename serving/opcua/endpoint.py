@@ -119,8 +119,8 @@ class OpcUaEndpoint:
 
     # ------------------------------------------------------------------ the loop's side
     def serve(self, law: Manifest) -> None:
-        """The law in charge is this one now: whether it goes on without a PV whose reading alone is bad."""
-        self._sampling.apart = "fresh" in law.inputs
+        """The law in charge is this one now: it may go on without a PV whose reading alone is bad, or an MV."""
+        self._sampling.serve(law)
 
     def start(self) -> None:
         """Begin to connect; returns at once."""
@@ -156,6 +156,7 @@ class OpcUaEndpoint:
         sample = Sample(
             values.pv, mv, values.dv, age * self.speed, values.fault, values.quality, ", ".join(late), values.bad_pv
         )
+        sample = replace(sample, local=values.local) if values.local else sample
         return self._late_apart(sample, values, late, now) if late and self._sampling.apart else sample
 
     def _late(self, values: Values, now: float) -> list[str]:

@@ -32,7 +32,7 @@ from loopwright.serving.opcua.nameplates import (
 from loopwright.serving.opcua.node_lease import NAME, WRITABLE, SeveralLeasesError, beside
 from loopwright.serving.opcua.plan import NodePlan, Role, Row, shared_node
 from loopwright.serving.opcua.sampling import NO_NUMBERS
-from loopwright.serving.opcua.settings import NO_LEASE, Nodes, Point, Server
+from loopwright.serving.opcua.settings import NO_LEASE, LocalNode, Nodes, Point, Server
 from loopwright.serving.opcua.values import (
     FLOATS,
     INTEGERS,
@@ -43,6 +43,7 @@ from loopwright.serving.opcua.values import (
     exact,
     words,
 )
+from loopwright.serving.operating import allowed
 from loopwright.serving.words import first_line
 
 NO_LEASE_NOTE = (
@@ -124,7 +125,8 @@ async def _inspected(
         except SeveralLeasesError as error:
             lease, several = "", first_line(error)
         asked = await _asked(link, server, [row.node for row in rows] + ([lease] if lease else []))
-        found = [_one(server, row, asked[row.node], margin) for row in rows]
+        said = {row.title: nodes.local[row.signal.name] for row in rows if row.role is Role.LOCAL and row.signal}
+        found = [_one(server, row, asked[row.node], margin, said.get(row.title)) for row in rows]
         back = nodes.hand_back
         if back is not None and not found[-1].wrong:
             found[-1] = replace(found[-1], wrong=_unfit(back.value, found[-1].kind))
@@ -268,7 +270,7 @@ def _outside(signal: Signal, number: float) -> str:
     return f"{number:.6g} lies outside {signal.low:g} .. {signal.high:g} {signal.unit}; another unit?"
 
 
-def _one(server: Server, row: Row, asked: _Asked | str, margin: float) -> Found:
+def _one(server: Server, row: Row, asked: _Asked | str, margin: float, local: LocalNode | None = None) -> Found:
     name, node, point, signal = row.name, row.node, row.point, row.signal
     if isinstance(asked, str):
         return Found(name, node, wrong=asked, written=row.written)
@@ -297,6 +299,11 @@ def _one(server: Server, row: Row, asked: _Asked | str, margin: float) -> Found:
     if not row.judged:
         wrong, note = "", "; ".join(filter(None, (wrong, note)))
     shown = "-" if reading.text else f"{number:.6g}"
+    if row.role is Role.LOCAL and local is not None and reading.quality != STATUS_BAD:
+        shown = reading.words_held or shown
+        has = local.plants(reading.number, reading.words_held) if shown != "-" else None
+        note = {None: note or wrong, True: "the plant has this MV now", False: "this loop has it"}[has]
+        wrong = ""
     return Found(name, node, kind, shown, unit, quality, age, limits, MAY[writable], wrong, note, passing, row.written)
 
 
@@ -305,8 +312,7 @@ def _no_value(row: Row, number: float) -> str:
     e = row.entry
     if e is None or (e.low <= number <= e.high and (e.what not in SWITCHES or number in (0.0, 1.0))):
         return ""
-    allowed = "0 or 1" if e.what in SWITCHES else f"{e.low:g} to {e.high:g} {e.unit}".rstrip()
-    return f"{number:.6g} is none that it may have; allowed is {allowed}"
+    return f"{number:.6g} is none that it may have; allowed is {allowed(e)}"
 
 
 def _other_range(limits: str, point: Point, signal: Signal) -> str:

@@ -30,6 +30,7 @@ class Role(Enum):
     DV = "DV"
     SP = "SP"
     OPERATE = "operate"
+    LOCAL = "local"
     MODE = "mode"
     WATCHDOG = "watchdog"
     HEARTBEAT = "heartbeat"
@@ -75,7 +76,7 @@ class Row:
     @property
     def measured(self) -> bool:
         """Whether the loop computes with its number."""
-        return not (self.written or self.request)
+        return not (self.written or self.request or self.role is Role.LOCAL)
 
     @property
     def ages(self) -> bool:
@@ -104,6 +105,8 @@ class NodePlan:
             self.rows.append(Row(Role.MODE, Point(nodes.mode.node)))
         if nodes.watchdog:
             self.rows.append(Row(Role.WATCHDOG, Point(nodes.watchdog)))
+        mvs = {s.name: s for s in manifest.mv}
+        self.rows += [Row(Role.LOCAL, Point(at.node), mvs[name]) for name, at in nodes.local.items()]
         self.outputs = [Row(Role.MV, mv[s.name], s, judged=True, written=True) for s in manifest.mv]
         self.extra = []
         if nodes.heartbeat:

@@ -113,6 +113,7 @@ class Values:
     unheard: Mapping[str, str] = field(default_factory=dict)  # why a set point or the mode is no request, by name
     bad_pv: tuple[str, ...] = ()
     asked_operate: Mapping[str, float] = field(default_factory=dict)
+    local: tuple[str, ...] = ()  # why the plant has each MV itself, or it is read badly alone; or empty
 
 
 class NodeSampling:
@@ -121,9 +122,18 @@ class NodeSampling:
     def __init__(self, manifest: Manifest, server: Server, nodes: Nodes, nameplates: Nameplates | None = None) -> None:
         self.manifest, self.server, self.nodes = manifest, server, nodes
         self.nameplates = nameplates or Nameplates(nodes, manifest)
-        self.apart = "fresh" in manifest.inputs  # whether the law goes on without a PV whose reading alone is bad
+        self._local: dict[
+            str, str
+        ] = {}  # why the plant has an MV by its own node; one that cannot be read tells nothing
+        self.serve(manifest)
         self._watched = float("nan"), 0  # the watchdog, and for how many readings it has stood there
         self._dead, self._slow = "", False  # why the plant counts as dead; whether its watchdog has moved since
+
+    def serve(self, law: Manifest) -> None:
+        """The law in charge: without which readings it goes on, where they alone are bad."""
+        self.apart = "fresh" in law.inputs
+        able = {e.signal for e in law.operate if e.group == "mv" and e.what == "use" and "operate" in law.inputs}
+        self.mvs_apart = able
 
     def valued(
         self,
@@ -137,7 +147,7 @@ class NodeSampling:
     ) -> Values:
         """Values that arrived at ``arrived_s``; ``unbeaten`` says why the last heartbeat did not arrive."""
         fault, typed, found, unheard = "", "", dict[str, float](), dict[str, str]()
-        bad = list[str]()
+        bad, away = list[str](), dict[str, str]()
         for row, answer in zip(plan.rows, answers, strict=False):
             name, point = row.name, row.point
             usable = answer.quality == STATUS_GOOD or (
@@ -155,11 +165,17 @@ class NodeSampling:
                     if row.request:
                         unheard[name] = changed
                     typed = typed or ("" if row.request else changed)
-            if row.judged and not (fault and row.role is not Role.PV):
+            of = "" if row.signal is None else row.signal.name
+            alone = row.role is Role.MV and of in self.mvs_apart
+            if row.judged and not (fault and row.role is not Role.PV and not alone):
                 why = self._wrong(row, answer)
                 if row.role is Role.PV:
                     bad.append(why)
-                fault = fault or ("" if self.apart and row.role is Role.PV else why)
+                if alone and why:
+                    away[of] = why
+                fault = fault or ("" if alone or (self.apart and row.role is Role.PV) else why)
+            if row.role is Role.LOCAL:
+                self._tells(of, answer, usable=usable)
         judge = self.server.source_time == "judge"
         timed = ages.update(arrived_s, [answers[i].source_s if judge else None for i in plan.timed])
         m = self.manifest
@@ -172,6 +188,7 @@ class NodeSampling:
             fault = self.dead(found["watchdog"])
         fault = fault or typed or self.nameplates.fault or unbeaten
         n = len(m.pv) + len(m.mv) + len(plan.dvs)
+        away = {name: why for name, why in (away | self._local).items() if name in self.mvs_apart}
         return Values(
             arrived_s,
             np.array([found[f"PV {s.name}"] for s in m.pv]),
@@ -191,7 +208,17 @@ class NodeSampling:
                 for e in m.operate
                 if np.isfinite(found.get(f"operate {e.name}", np.nan))
             },
+            tuple(away.get(s.name, "") for s in m.mv) if away else (),
         )
+
+    def _tells(self, name: str, answer: NodeReading, *, usable: bool) -> None:
+        """Keep what an MV's own node says of it; one that is read badly leaves it as it was."""
+        if not usable or not (answer.words_held or np.isfinite(answer.number)):
+            return
+        self._local.pop(name, None)
+        if self.nodes.local[name].plants(answer.number, answer.words_held):
+            said = answer.words_held or f"{answer.number:g}"
+            self._local[name] = Fault(f"MV {name} is the plant's: its node says {said}", "local", f"MV {name}")
 
     def _wrong(self, row: Row, answer: NodeReading) -> str:
         """Why a value is not used; empty: it is."""

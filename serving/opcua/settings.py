@@ -58,6 +58,34 @@ class ModeNode:
 
 
 @dataclass(frozen=True, slots=True)
+class LocalNode:
+    """A node that says whether the plant has an MV itself, by numbers or texts.
+
+    The plant has it at one of the values ``local``, or at any value that is none of ``remote``: one of both is given.
+    """
+
+    node: str
+    local: tuple[float | bool | str, ...] = ()
+    remote: tuple[float | bool | str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.node:
+            raise LoopError("node is empty; it needs a node id such as 'nsu=urn:plant;s=FIC101.MODE'")
+        if bool(self.local) == bool(self.remote):
+            raise LoopError(
+                'either `local` lists the values at which the plant has the MV, as ["MAN"] or [0], or `remote` those '
+                "at which this loop has it"
+            )
+
+    def plants(self, number: float, text: str) -> bool:
+        """Whether the plant has the MV where the node holds this number (NaN: none) or this text (empty: none)."""
+        listed = self.local or self.remote
+        named = any(isinstance(v, str) and v.strip().casefold() == text.strip().casefold() for v in listed)
+        found = named or any(not isinstance(v, str) and float(v) == number for v in listed)
+        return found == bool(self.local)
+
+
+@dataclass(frozen=True, slots=True)
 class HandBack:
     """The node by which the plant's own controller takes the plant, and the number that asks it to."""
 
@@ -72,7 +100,8 @@ class Nodes:
     ``heartbeat`` counts the loop's scans. ``watchdog`` is a number that the server's side changes while it lives; it
     counts as dead after ``watchdog_scans`` scans without a change. ``lease`` is a text that holds who controls this
     plant. Without it a node LoopwrightLease is the lease that lies beside those of the MVs; "none": there is no lease.
-    ``operate`` has nodes by which the plant's own operator changes values of the law's ``operate``, each by its name.
+    ``operate`` has nodes by which the plant's own operator changes values of the law's ``operate``, each by its name,
+    ``local`` those that say whether the plant has an MV itself.
     """
 
     pv: Mapping[str, str | Point]
@@ -80,6 +109,7 @@ class Nodes:
     dv: Mapping[str, str | Point] = field(default_factory=dict)
     sp: Mapping[str, str | Point] = field(default_factory=dict)
     operate: Mapping[str, str | Point] = field(default_factory=dict)
+    local: Mapping[str, LocalNode] = field(default_factory=dict)
     mode: ModeNode | None = None
     heartbeat: str = ""
     watchdog: str = ""
@@ -99,7 +129,7 @@ class Nodes:
         """Every node id that is given, as it is written."""
         groups: tuple[Group, ...] = ("pv", "dv", "mv", "sp", "operate")
         points = [p for name in groups for p in self.points(name).values()]
-        others = [p.node for p in (self.mode, self.hand_back) if p is not None]
+        others = [p.node for p in (self.mode, self.hand_back, *self.local.values()) if p is not None]
         texts = [*(t for p in points for t in (p.node, p.read_back)), *others]
         return [t for t in [*texts, self.heartbeat, self.watchdog, self.lease] if t and t != NO_LEASE]
 
@@ -119,6 +149,12 @@ class Nodes:
                 raise LoopError(f"nodes.{name} lacks {', '.join(missing)}; give each a node id")
             if name != "mv" and any(p.read_back for p in points.values()):
                 raise LoopError(f"nodes.{name} has a read_back, which only an MV has")
+        able = [e.signal for e in manifest.operate if e.group == "mv" and e.what == "use"]
+        for given in self.local:
+            if given not in able:
+                raise LoopError(
+                    f"nodes.local has {given!r}, an MV without which the law cannot do{nearest(given, able)}"
+                )
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import hmac
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path, PurePath
 from typing import Any
@@ -21,17 +21,21 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
 from loopwright.serving.active_controller import require_fits
-from loopwright.serving.controller_file import file_digest, unseal
+from loopwright.serving.controller_file import controller_files, file_digest, unseal
 from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
 from loopwright.serving.graph.audit import MAX_GRAPH_BYTES, audit
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
+from loopwright.serving.monitor.weekly_report import plain_rows, week_reports
 from loopwright.serving.page.access import LONGEST_BODY, Access
+from loopwright.serving.page.foresight import LawForesight
 from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, Shared, shown
+from loopwright.serving.page.prometheus import metrics_text
 from loopwright.serving.page.trend import MOST_POINTS, trend
-from loopwright.serving.words import plain
+from loopwright.serving.words import first_line
 
 MOST_FILES = 50  # files that are looked at
+SHOWN_WEEKS = 5  # weeks that the card shows: a month and the present one
 
 
 def candidates(
@@ -45,8 +49,8 @@ def candidates(
     """
     found: list[dict[str, Any]] = []
     now, _, _ = _described(first or in_charge, trusted)
-    beside = (p for p in in_charge.parent.glob("*.onnx") if p.is_file())  # no pipe, which would never end
-    for path in sorted(beside)[:MOST_FILES]:
+    beside = (p for p in controller_files(in_charge.parent) if p.is_file())  # no pipe, which would never end
+    for path in list(beside)[:MOST_FILES]:
         try:
             manifest, sha256, signed = _described(path, trusted)
             require_fits(manifest, now)
@@ -74,75 +78,13 @@ def _described(path: Path, trusted: Sequence[str] | None) -> tuple[Manifest, str
     return Manifest.from_json(audit(data).metadata[MANIFEST_KEY]), sha256, None if signed is None else signed.words
 
 
-# ----------------------------------------------------- the state of a loop as Prometheus text, exposition format 0.0.4
-MODES = ("SHADOW", "MANUAL", "AUTO", "HOLD")
-LEVELS = {"not known yet": -1, "as validated": 0, "watch": 1, "retrain": 2}
-GROUPS = (
-    ("setpoint", "sp", "sp", "Set point, in the signal's unit."),
-    ("process_variable", "pv", "pv", "Process variable, in the signal's unit."),
-    ("manipulated_variable", "mv", "mv", "Manipulated variable that the loop asks for; none in SHADOW."),
-    ("applied", "applied", "mv", "Manipulated variable that the actuator has."),
-    ("law", "law", "mv", "Manipulated variable that the law wants."),
-)
-
-
-def metrics_text(about: Mapping[str, Any], state: Mapping[str, Any]) -> str:
-    """One gauge or counter a line, each family with its help."""
-    lines: list[str] = []
-    for name, kind, words, rows in _families(about, state):
-        lines += [f"# HELP loopwright_{name} {words}", f"# TYPE loopwright_{name} {kind}"]
-        lines += [f"loopwright_{name}{_labels(labels)} {float(value)!r}" for labels, value in rows if value is not None]
-    return "\n".join(lines) + "\n"
-
-
-def _families(about: Mapping[str, Any], state: Mapping[str, Any]) -> Iterator[tuple[str, str, str, Iterable[Any]]]:
-    none: Mapping[str, str] = {}
-    card = about["card"]
-    info = {"law": card["law"], "case": card["case"], "sha256": card["sha256"], "file": card["file"]}
-    yield "controller_info", "gauge", "The controller in charge.", [(info, 1)]
-    yield "up", "gauge", "1 while the loop scans.", [(none, int(state["alive"]))]
-    yield "mode", "gauge", "1 for the present mode.", [({"mode": m}, int(m == state["mode"])) for m in MODES]
-    for name, words in (
-        ("scans", "Scans since the loop's start."),
-        ("missed", "Periods without a scan, because the machine was late."),
-        ("faults", "Scans with a fault."),
-        ("connections", "Connections that were made to the plant's server."),
-    ):
-        value = state.get({"scans": "scan"}.get(name, name))
-        yield f"{name}_total", "counter", words, [(none, value)]
-    yield "last_scan_seconds", "gauge", "Time of the last scan, since 1970.", [(none, state["time"])]
-    yield "journal_ok", "gauge", "1 while the journal can be written.", [(none, int(not state.get("journal")))]
-    lost = "Scans and events that the journal has lost, or never got because the disk took none."
-    yield "journal_lost_total", "counter", lost, [(none, state.get("journal_lost"))]
-    for name, key, group, words in GROUPS:
-        signals = about["signals"][group]
-        values = state.get(key) or [None] * len(signals)
-        rows = [({"signal": s["name"], "unit": s["unit"]}, v) for s, v in zip(signals, values, strict=False)]
-        yield name, "gauge", words, rows
-    infos = zip(about["info"], state.get("info") or [], strict=False)
-    yield "info", "gauge", "Numbers that the law tells of itself.", [({"name": name}, v) for name, v in infos]
-    numbers = state.get("numbers") or {}
-    yield "monitor", "gauge", "Numbers that the monitor has measured.", [({"name": n}, v) for n, v in numbers.items()]
-    verdicts = state.get("verdicts") or []
-    levels = [({"name": v["name"]}, LEVELS[v["level"]]) for v in verdicts if v["level"] in LEVELS]
-    words = "Is the controller still right? 0 as validated, 1 watch, 2 retrain, -1 not known yet."
-    yield "verdict", "gauge", words, levels
-
-
-def _labels(labels: Mapping[str, Any]) -> str:
-    """Labels in braces, with what the format forbids in a value escaped."""
-    if not labels:
-        return ""
-    escaped = {k: plain(str(v)).replace("\\", r"\\").replace('"', r"\"") for k, v in labels.items()}
-    return "{" + ",".join(f'{k}="{v}"' for k, v in escaped.items()) + "}"
-
-
 # ------------------------------------------------------------------------------------------------------------ the page
 STATIC = Path(__file__).parent / "static"
 BODY_S = 5.0  # in which the body of a change must be here
 LONGEST_SPAN_S = 400 * 86_400.0  # [s] of a trend that a browser may ask for
 TELL_S = 60.0  # between two lines about wrong tokens
 TRENDS, WAITING_TRENDS = 2, 10  # that are computed at a time, and that may wait for it
+WAITING_LOOKS = 10  # changes that are looked at beforehand, one after the other: each takes up to a second of a core
 TRENDS_LATER_S = 2  # after which a trend beyond them may be asked for again
 
 
@@ -156,6 +98,9 @@ class PageApp:
         self._described = Shared(self._describe)
         self._told = -math.inf
         self._trends, self._waiting = asyncio.Semaphore(TRENDS), 0
+        self._foresight = LawForesight(lambda: ask({"do": "inputs"}))
+        self._explained = Shared(lambda: asyncio.to_thread(self._foresight.explained))
+        self._looks, self._looking = asyncio.Semaphore(1), 0
 
     def asgi(self, hosts: Sequence[str], scheme: str) -> Starlette:
         """The application, for those who ask for one of ``hosts``."""
@@ -165,8 +110,11 @@ class PageApp:
             Route("/api/state", self.state),
             Route("/api/trend", self.trend),
             Route("/api/events", self.events),
+            Route("/api/weeks", self.weeks),
             Route("/api/live", self.stream),
             Route("/api/picture/{digest}", self.picture),
+            Route("/api/explain", self.explain),
+            Route("/api/what-if", self.what_if, methods=["POST"]),
             Route("/api/change", self.change, methods=["POST"]),
             Route("/metrics", self.metrics),
             Route("/healthz", self.healthz),
@@ -253,6 +201,11 @@ class PageApp:
 
         return JSONResponse({"events": await asyncio.to_thread(read)})
 
+    async def weeks(self, _: Request) -> Response:
+        """The last weeks in plain words, newest first."""
+        found = await asyncio.to_thread(week_reports, self.journal, SHOWN_WEEKS)
+        return JSONResponse({"weeks": plain_rows(found[::-1])})
+
     async def stream(self, request: Request) -> Response:
         """News, as server-sent events."""
         if request.method == "HEAD":
@@ -272,19 +225,37 @@ class PageApp:
                 self._told = time.monotonic()
                 self.tell(f"page: a wrong token was refused (from {request.client.host if request.client else '?'})")
             return JSONResponse({"error": "the token is not the loop's; it prints its token at its start"}, 401)
-        try:
-            async with asyncio.timeout(BODY_S):
-                wanted = json.loads(await _body(request))
-        except TimeoutError:
-            raise HTTPException(408, "the change did not arrive in time") from None
-        except (ValueError, RecursionError):
-            raise HTTPException(400, "the change is no JSON") from None
-        if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "picture"}:
+        wanted = await _json(request)
+        if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "inputs", "picture"}:
             raise HTTPException(400, 'a change is an object with "do"')
         if wanted.get("do") == "swap" and not _is_name(wanted.get("value")):
             raise HTTPException(400, "the page tries only files that lie beside the controller in charge, by name")
         answer = await asyncio.to_thread(self.ask, wanted)
         return JSONResponse(answer, 409 if "error" in answer else 200)
+
+    async def explain(self, _: Request) -> Response:
+        """Courses that the law in charge predicts and plans, and the parts of its next moves; 404 without them."""
+        try:
+            return JSONResponse(await self._explained())
+        except LoopwrightError as error:
+            return JSONResponse({"error": first_line(error)}, 404)
+
+    async def what_if(self, request: Request) -> Response:
+        """Courses after some changes, which are not made, beside those without them."""
+        wanted = await _json(request)
+        changes = wanted.get("changes") if isinstance(wanted, dict) else None
+        if not isinstance(changes, dict) or not changes:
+            raise HTTPException(400, 'a what-if is {"changes": {the name of a set point or entry: a number}}')
+        if self._looking >= WAITING_LOOKS:
+            raise HTTPException(503, "many changes are being looked at; ask again in a moment", {"Retry-After": "1"})
+        self._looking += 1
+        try:
+            async with self._looks:
+                return JSONResponse(await asyncio.to_thread(self._foresight.what_if, changes))
+        except LoopwrightError as error:
+            return JSONResponse({"error": first_line(error), **({"entry": error.entry} if error.entry else {})}, 409)
+        finally:
+            self._looking -= 1
 
     async def metrics(self, _: Request) -> Response:
         """For Prometheus."""
@@ -314,6 +285,17 @@ def _number(request: Request, name: str, otherwise: float | None = None) -> floa
     if number is None or not math.isfinite(number):
         raise HTTPException(400, f"{name} must be a number")
     return number
+
+
+async def _json(request: Request) -> Any:
+    """The content of a request; HTTPException where it is late or no JSON."""
+    try:
+        async with asyncio.timeout(BODY_S):
+            return json.loads(await _body(request))
+    except TimeoutError:
+        raise HTTPException(408, "the change did not arrive in time") from None
+    except (ValueError, RecursionError):
+        raise HTTPException(400, "the change is no JSON") from None
 
 
 async def _body(request: Request) -> bytes:

@@ -65,6 +65,7 @@ def control_loop(
         operate=s.operate,
         bridge_s=s.fresh.bridge_s,
         critical=s.fresh.critical,
+        local_s=s.local.after_s,
     )
 
 

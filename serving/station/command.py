@@ -9,6 +9,7 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import fields
@@ -24,6 +25,7 @@ from loopwright.serving.guard import Sample
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command, Mode
 from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.preview.course_file import read_courses
 from loopwright.serving.station.control import ask
 from loopwright.serving.station.journal_export import export, happened, journal_of, lines, tag_table, write_csv
 from loopwright.serving.station.requests import TRIAL
@@ -59,6 +61,11 @@ def options(parser: argparse.ArgumentParser) -> None:
     events.add_argument("--since", metavar="TIME", default="", help="from then on, as 2026-03-01T14:30 (UTC)")
     events.add_argument("--last", metavar="N", type=int, help="the last N only")
     events.add_argument("--csv", action="store_true", help="as CSV, for other tools")
+    report = commands.add_parser("report", help="a week in plain words: time on control, and what bound the signals")
+    report.add_argument(
+        "file", metavar="FILE", type=Path, nargs="?", default=SETTINGS, help="loop.toml or a journal (%(default)s)"
+    )
+    report.add_argument("--weeks", metavar="N", type=int, default=1, help="the last N weeks (%(default)s)")
 
 
 def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -78,11 +85,18 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
             help="let a controller into AUTO although its file does not prove it",
         )
     operate = "what operators may change of the law: ranges, uses, limits"
-    for name, words in (("sp", "set points"), ("mv", "MVs, in MANUAL"), ("operate", operate)):
+    for name, words in (("sp", "set points"), ("mv", "MVs by hand, in MANUAL or out of use"), ("operate", operate)):
         values = commands.add_parser(name, help=f"change {words}")
         values.add_argument("values", metavar="NAME=VALUE", nargs="+", help="of one or more signals, in their units")
+    course = commands.add_parser("course", help="give set points and forecasts of disturbances to come, or end them")
+    known = course.add_mutually_exclusive_group(required=True)
+    known.add_argument("courses", metavar="FILE.csv", type=Path, nargs="?", help="times, and values by signal")
+    known.add_argument("--end", metavar="NAME", nargs="*", help="end the courses of these signals, or of all")
+    course.add_argument(
+        "--straight", metavar="NAME", action="append", default=[], help="a set point that runs straight to each value"
+    )
     state = commands.add_parser("state", help="how the loop stands, as JSON")
-    for parser in (swap, mode, *(commands.choices[name] for name in ("sp", "mv", "operate")), state):
+    for parser in (swap, mode, *(commands.choices[name] for name in ("sp", "mv", "operate")), course, state):
         parser.add_argument("--loop", metavar="LOOP.TOML", type=Path, default=SETTINGS, help="which (%(default)s)")
         if parser is not state:
             parser.add_argument("--who", default=_user(), help="written down (%(default)s)")
@@ -92,6 +106,7 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
 def run(options: argparse.Namespace) -> int:
     """Do what was asked for; the exit status."""
     does = {"init": _init, "check": _check, "run": _run, "export": _export, "events": _events, "state": _state}
+    does["report"] = _report
     return does.get(options.action, _ask)(options)
 
 
@@ -117,6 +132,12 @@ def _ask(options: argparse.Namespace) -> int:
         value = options.mode
     elif do in {"sp", "mv", "operate"}:
         value = dict(_pair(text) for text in options.values)
+    elif do == "course":
+        value = (
+            {"points": read_courses(options.courses, time.time()), "straight": options.straight}
+            if options.courses
+            else ({"end": options.end} if options.end else None)
+        )
     elif options.back or options.keep:
         do, value = ("back", {"trial": options.trial}) if options.back else ("keep", None)
     else:
@@ -335,6 +356,15 @@ def _events(options: argparse.Namespace) -> int:
         write_csv(events, sys.stdout)
     else:
         print("\n".join(lines(events) or ["nothing has happened there"]))
+    return 0
+
+
+def _report(options: argparse.Namespace) -> int:
+    from loopwright.serving.monitor.weekly_report import week_reports
+
+    reports = week_reports(journal_of(options.file), options.weeks)
+    for i, report in enumerate(reports):
+        print("\n".join([*[""] * bool(i), *map(plain, report.lines())]))
     return 0
 
 

@@ -120,6 +120,6 @@ class _Handler(socketserver.StreamRequestHandler):
         except NotProvenError as error:  # whoever asked may give the word
             return {"error": first_line(error), "needs": "accept_unproven", "unproven": plain(error.why)}
         except LoopwrightError as error:
-            return {"error": first_line(error)}
+            return {"error": first_line(error), **({"entry": plain(error.entry)} if error.entry else {})}
         except Exception as error:
             return {"error": f"the request cannot be read: {named(error)}"}

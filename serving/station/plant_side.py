@@ -15,7 +15,7 @@ from loopwright.serving.loop import ControlLoop, Mode
 from loopwright.serving.manifest import Manifest, OperateEntry, Signal
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.station.recorder import Recorder
-from loopwright.serving.station.requests import NodeRequests, is_contact, require_proven
+from loopwright.serving.station.requests import NodeRequests, ended_words, is_contact, require_proven
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.words import first_line
 
@@ -63,7 +63,7 @@ class PlantSide:
                 wanted = loop.sp
                 wanted[i] = changed[s.name]
                 what = f"set point {shown_values(wanted[i : i + 1], (s,))}"
-                self.carried_out(partial(loop.set_sp, wanted), what)
+                self.carried_out(partial(_set_sp, loop, wanted), what)
 
     def set_operate(self, loop: ControlLoop, changed: Mapping[str, float]) -> None:
         """All at once, as both ends of a range may move; where they are refused, signal by signal.
@@ -99,6 +99,11 @@ class PlantSide:
             self.recorder.note("change", "plant", f"refused: {what} ({first_line(error)})")
             return
         self.recorder.note("change", "plant", what, reason, mode=mode)
+
+
+def _set_sp(loop: ControlLoop, wanted: Array) -> str:
+    """Set them; what is to be said beside it: courses that end by it."""
+    return ended_words(loop.set_sp(wanted)).removeprefix("; ")
 
 
 def _refusal(loop: ControlLoop, values: Mapping[str, float]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
 from math import ceil, nan
 from typing import TypeAlias
@@ -21,6 +21,7 @@ from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.monitor import Monitor
+from loopwright.serving.monitor.weekly import WEEK, WeeklyCounts, counts_of, week_of
 from loopwright.serving.words import plain
 
 Array: TypeAlias = NDArray[np.float64]
@@ -34,6 +35,7 @@ class Recorder:
         self._controller: Controller | None = None
         self._fault, self._trial, self._mode = "", "", ""
         self._bad: dict[str, bool] = {}  # PVs that were bridged, or left out (True)
+        self._local: Mapping[str, str] = {}  # MVs that the plant had itself
 
     @property
     def controller(self) -> Controller:
@@ -86,6 +88,9 @@ class Recorder:
             what = lasting(command.fault) or f"over: {lasting(before)}"
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.fault))
         self._bridged(command)
+        for name in loop.courses.finished:
+            self.note("change", "loop", f"the course of {name} is over")
+        self._taken(command)
         self._changed(command)
         if loop.controller is not self.controller:
             self.note("swap", "loop", f"{named(loop.controller)} has the plant, after {named(self.controller)}")
@@ -110,6 +115,16 @@ class Recorder:
                 words = f"PV {name} is read again"
                 self.note("fault", "loop", f"over: {words}" if before else words, alarm=alarm if before else "")
         self._bad = now
+
+    def _taken(self, command: Command) -> None:
+        """Say which MVs the plant has itself, which is an alarm, and which it has given back."""
+        before, self._local = self._local, command.local
+        for name, why in command.local.items():
+            if name not in before or kind_of(before[name]) != kind_of(why):
+                self.note("fault", "loop", f"MV {name} is out: {lasting(why)}", alarm=f"actuator {name}", raised=True)
+        for name in before:
+            if name not in command.local:
+                self.note("fault", "loop", f"over: MV {name} is the loop's again", alarm=f"actuator {name}")
 
     def _changed(self, command: Command) -> None:
         """Say that the mode is another one though nobody asked for it: HOLD by a fault, and the way back."""
@@ -155,6 +170,7 @@ def _listed(values: Array | None, n: int) -> Iterable[float]:
 
 ALARMING, ALARM = {"watch", "retrain"}, "monitor "
 VERDICT_LOOK_S, KEEP_S = 10.0, 600.0  # between two looks at the verdicts, and two writings of what was learnt
+KEEP_WEEK_S = 60.0  # between two writings of a week's counts: so much of them is lost at most when the process dies
 
 
 class MonitorRunner:
@@ -167,31 +183,56 @@ class MonitorRunner:
         self._levels = self._active()
         self._scans = 0  # the clock may be set; scans go on
         self.monitor = self._begun(controller)
+        self.weekly = self._this_week()
 
-    def seen(self, controller: Controller, scan: tuple[Sample | None, Command, float]) -> None:
-        """A scan, with its time; now and then what the verdicts have become. It never raises."""
+    def seen(
+        self, controller: Controller, scan: tuple[Sample | None, Command, float], operate: Array | None = None
+    ) -> None:
+        """A scan, with its time and what operators want; now and then what verdicts have become. It never raises."""
         try:
-            self._seen(controller, scan)
+            self._seen(controller, scan, operate)
         except Exception as error:  # a scan is more than what is thought of it
             self._failed(f"{type(error).__name__}: {error}")
 
-    def _seen(self, controller: Controller, scan: tuple[Sample | None, Command, float]) -> None:
+    def _seen(self, controller: Controller, scan: tuple[Sample | None, Command, float], operate: Array | None) -> None:
         if controller is not self._of:
             self.keep()
             self._over(self._levels)
             self._of, self._levels = controller, {}
             self.monitor = self._begun(controller)
         sample, command, time_s = scan
-        self.monitor.observe(time_s, sample, command)
+        self.monitor.observe(time_s, sample, command, operate)
+        if self.weekly.counts and week_of(time_s) != self.weekly.week:
+            self._keep_week()
+        self.weekly.add(controller.manifest, sample, command, time_s, operate)
         self._scans += 1
         period_s = controller.manifest.period_s
+        if self._scans % ceil(KEEP_WEEK_S / period_s) == 0:
+            self._keep_week()
         if self._scans % ceil(VERDICT_LOOK_S / period_s) == 0:
             self._look()
         if self._scans % ceil(KEEP_S / period_s) == 0:
             self.keep()
 
+    def _keep_week(self) -> None:
+        self._recorder.journal.keep(f"{WEEK}{self.weekly.week}", self.weekly.text())
+
+    def _this_week(self) -> WeeklyCounts:
+        """The counts of the present week that a loop before this one has left."""
+        week, kept = week_of(time.time()), None
+        with suppress(LoopError, sqlite3.Error), closing(JournalReader(self._recorder.journal.path)) as reader:
+            kept = reader.learnt(f"{WEEK}{week}")
+        if kept is not None:
+            try:
+                return WeeklyCounts(week, counts_of(kept))
+            except (ValueError, RecursionError) as error:
+                self._recorder.note("monitor", "monitor", f"this week is counted anew: {error}")
+        return WeeklyCounts()
+
     def keep(self) -> None:
-        """Write down what was learnt; a monitor whose numbers are none learns anew."""
+        """Write down what was counted and learnt; a monitor whose numbers are none learns anew."""
+        if self.weekly.counts:
+            self._keep_week()
         try:
             text = json.dumps(self.monitor.state(), allow_nan=False)
         except ValueError:

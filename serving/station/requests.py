@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from typing import Any, NamedTuple, TypeAlias
@@ -15,6 +15,7 @@ from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import ControlLoop, Mode, within
 from loopwright.serving.manifest import Signal
 from loopwright.serving.opcua.sampling import Values
+from loopwright.serving.preview.course import described
 from loopwright.serving.station.recorder import named
 from loopwright.serving.trust import require_accepted, signer
 
@@ -133,10 +134,19 @@ def change(request: Request, loop: ControlLoop, opened: Opened) -> Change:
 
     A file of another controller is read here, by ``opened``, so that no scan waits for it.
     """
-    does = {"mode": _mode, "sp": _sp, "mv": _mv, "operate": _operate, "swap": _swap, "keep": _keep, "back": _back}
+    does = {
+        "mode": _mode,
+        "sp": _sp,
+        "mv": _mv,
+        "operate": _operate,
+        "course": _course,
+        "swap": _swap,
+        "keep": _keep,
+        "back": _back,
+    }
     made = does.get(request.do)
     if made is None:
-        known = (*does, "acknowledge", "state", "about")
+        known = (*does, "acknowledge", "state", "about", "inputs")
         raise LoopError(f"the loop cannot {request.do!r}{nearest(request.do, known)}")
     return made(request, loop, opened)
 
@@ -173,23 +183,62 @@ def _sp(request: Request, loop: ControlLoop, _: Opened) -> Change:
     wanted = _numbers(request.value, signals, loop.sp.tolist(), "set point")
     within(wanted, signals, "set point")
     what = _moves(loop.sp.tolist(), wanted, signals, "set point")
+    followed = [name for name in request.value if name in loop.courses.ends]
 
     def act(loop: ControlLoop) -> None:
         # Of what stands there then: somebody else may have changed another one since.
         loop.set_sp(_numbers(request.value, signals, loop.sp.tolist(), "set point"))
+        loop.courses.end(request.value)  # also where the value stays: the one who sets it wants it to
 
-    return Change(act, what, request.who, request.reason)
+    return Change(act, f"{what}{ended_words(followed)}", request.who, request.reason)
+
+
+def ended_words(names: Sequence[str]) -> str:
+    """Words that say of which signals a course ends; none of none."""
+    return f"; the course of {', '.join(names)} ends" if names else ""
+
+
+def _course(request: Request, loop: ControlLoop, _: Opened) -> Change:
+    value, known = request.value, ("points", "straight")
+    if value is None or (isinstance(value, Mapping) and set(value) == {"end"} and _are_names(value["end"])):
+        names = tuple(loop.courses.ends) if value is None else tuple(value["end"])
+        without = [name for name in names if name not in loop.courses.ends]
+        if without or not names:
+            raise LoopError(f"{', '.join(without) or 'no signal'} has a course now")
+        what = f"the course of {', '.join(names)} ends"
+        return Change(lambda loop: _ended(loop, names), what, request.who, request.reason)
+    if not isinstance(value, Mapping) or set(value) - set(known) or not _are_names(value.get("straight", [])):
+        raise LoopError(
+            'a course needs {"points": {NAME: [[time_s, value], ..]}, "straight": [NAME, ..]}, or {"end": [..]}'
+        )
+    points, straight = value.get("points", {}), tuple(value.get("straight", ()))
+    loop.require_course(points, straight)
+    m = loop.manifest
+    return Change(
+        lambda loop: loop.set_course(points, straight),
+        f"course of {described(points, (*m.sp, *m.dv))}",
+        request.who,
+        request.reason,
+    )
+
+
+def _ended(loop: ControlLoop, names: Sequence[str]) -> None:
+    loop.courses.end(names)
+
+
+def _are_names(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(name, str) for name in value)
 
 
 def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
     signals = loop.controller.manifest.mv
     wanted = _numbers(request.value, signals, loop.mv_wanted.tolist(), "MV")
     within(wanted, signals, "MV")
-    if loop.mode is not Mode.MANUAL:
-        raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {loop.mode}")
+    loop.require_in_hand(request.value)
     what = _moves(loop.mv_wanted.tolist(), wanted, signals, "MV")
 
     def act(loop: ControlLoop) -> None:
+        loop.require_in_hand(request.value)
         loop.set_mv(_numbers(request.value, signals, loop.mv_wanted.tolist(), "MV"))
 
     return Change(act, what, request.who, request.reason)

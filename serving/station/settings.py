@@ -9,7 +9,6 @@ from math import isfinite
 from pathlib import Path
 from typing import Literal
 
-from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import nearest, parse, refused
@@ -18,6 +17,7 @@ from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.modes import Fallback
 from loopwright.serving.opcua.settings import Nodes, Server
 from loopwright.serving.page.process import Page
+from loopwright.serving.station.toml_lines import fresh_lines, key_of, node_id, operate_lines, text_of
 from loopwright.serving.words import first_line, plain
 
 MAX_AGE = 1.5  # periods: one answer may be late, two may not
@@ -81,6 +81,20 @@ class Bridge:
 
 
 @dataclass(frozen=True, slots=True)
+class Local:
+    """The MVs that the plant has itself, for a law with ``use`` of them; nodes.local says where the plant tells.
+
+    It has one, too, that reads back elsewhere than commanded for ``after_s`` [s] (0: never, None: 20 periods).
+    """
+
+    after_s: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.after_s is not None and not (isfinite(self.after_s) and self.after_s >= 0):
+            raise LoopError(f"after_s is {self.after_s}; it must be a finite number of seconds, 0 (never) or more")
+
+
+@dataclass(frozen=True, slots=True)
 class Hold:
     """Action after a fault.
 
@@ -139,8 +153,9 @@ class Settings:
     ``trusted`` names public keys: only a controller that one of them signed is loaded, at the start and by a swap
     (None: any is). ``accept_unproven`` lets a controller into AUTO whose file does not prove it in closed loop, see
     ``loopwright.serving.trust``. ``operate`` has values of the law's ``operate`` by name that the loop begins with, in
-    place of the law's own. ``page`` is HOST:PORT or a table (see ``loopwright.serving.page.process``); empty:
-    none.
+    place of the law's own; with ``restore`` those that operators had set when the last loop ended come in their place,
+    and its set points, if its controller is the same. ``page`` is HOST:PORT or a table (see
+    ``loopwright.serving.page.process``); empty: none.
     """
 
     controller: Path
@@ -154,7 +169,9 @@ class Settings:
     transfer_s: float | None = None
     guards: Guards = Guards()
     fresh: Bridge = Bridge()
-    operate: Mapping[str, float] = field(default_factory=dict)
+    local: Local = Local()
+    operate: Mapping[str, float | bool] = field(default_factory=dict)
+    restore: bool = False
     hold: Hold = Hold()
     journal: JournalSettings = JournalSettings()
     page: str | Page = ""
@@ -237,17 +254,18 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
     lines = [
         f"# The loop of {plain(m.law)} for {plain(m.case)}, a scan every {period:g} s.",
         "# `loopwright loop check` reads every node and writes none.",
-        f"controller = {_text(path.as_posix())}",
+        f"controller = {text_of(path.as_posix())}",
         f'sha256 = "{controller.sha256}"  # this very file and no other',
         '# trusted = ["maker.pub"]  # only controllers that one of these public keys signed; see docs/trust.md',
         'start = "SHADOW"  # the law is computed and shown, nothing is written; or MANUAL, AUTO',
+        *["# restore = true  # begins with what operators had set when it last ended"] * bool(m.operate),
         "# accept_unproven = true  # lets a controller into AUTO although its file does not prove it",
         "# speed = 10  # times the clock, for a plant that is simulated as fast: `loopwright plant serve --speed 10`",
         'page = "127.0.0.1:8080"  # the operator\'s page; leave it out for none',
         f"transfer_s = {over:g}  # [s] in which an MV crosses its range at most once after a change to AUTO",
         "",
         "[server]",
-        f"endpoint = {_text(endpoint)}",
+        f"endpoint = {text_of(endpoint)}",
         'security = "Basic256Sha256"  # signed and encrypted',
         'certificate = "loop-certificate.der"  # let the server trust it',
         'private_key = "loop-key.pem"  # keep it to yourself',
@@ -267,8 +285,8 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         "",
         "[nodes.mv]  # read_back: what the actuator really has",
         *(
-            f"{_key(s.name)} = {{ node = {_text(_id('MV', s.name))}, read_back = {_text(_id('RB', s.name))} }}"
-            f"  # {_words(s)}"
+            f"{key_of(s.name)} = {{ node = {text_of(node_id('MV', s.name))}, "
+            f"read_back = {text_of(node_id('RB', s.name))} }}  # {_words(s)}"
             for s in m.mv
         ),
     ]
@@ -279,21 +297,21 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         "",
         "# [nodes.sp]  # set points that the plant's own operator sets",
         *(f"# {_node('SP', s)}" for s in m.sp),
-        *_operate_nodes(m),
+        *operate_lines(m),
         "",
         "[nodes]  # what the two sides tell each other; leave out what the plant has not",
-        f'heartbeat = "{_id("Control", "Heartbeat")}"  # counts the scans, for the plant to watch',
-        f'watchdog = "{_id("Control", "Watchdog")}"  # a number that the plant changes while it lives',
+        f'heartbeat = "{node_id("Control", "Heartbeat")}"  # counts the scans, for the plant to watch',
+        f'watchdog = "{node_id("Control", "Watchdog")}"  # a number that the plant changes while it lives',
         "watchdog_scans = 3  # without a change: a fault",
         '# lease = "nsu=...;s=..."  # a text: which loop writes; unnamed: LoopwrightLease beside the MVs; or "none"',
-        f'# hand_back = {{ node = "{_id("Control", "Owner")}", value = 0 }}',
+        f'# hand_back = {{ node = "{node_id("Control", "Owner")}", value = 0 }}',
         "",
         "[guards]  # when a sample is refused: the loop holds",
         f"max_age_s = {MAX_AGE * period:g}",
         "margin = 0.05  # share of a PV's range by which it may exceed it",
         "frozen = 0  # samples for which a PV may stand still to the bit; 0: for ever",
         f"# rate = {_table(m.pv, lambda s: (s.high - s.low) / 10)}  # largest change a scan",
-        *_fresh(m),
+        *fresh_lines(m),
         "",
         "[hold]  # what follows a fault",
         "recover_after = 5  # good samples until AUTO; 0: only the operator",
@@ -303,7 +321,7 @@ def template(controller: Controller, path: Path, endpoint: str, journal: str = "
         f"# rate = {_table(m.mv, lambda s: (s.high - s.low) / 60)}  # [unit/s] on the way there",
         "",
         "[journal]",
-        f"file = {_text(journal)}",
+        f"file = {text_of(journal)}",
         "max_mb = 2000  # the oldest scans go beyond that",
         'fsync = "crash"  # what it survives without loss; "power loss" waits for the disk each time',
         "",
@@ -319,54 +337,12 @@ def _ordered(lines: Sequence[str]) -> list[str]:
     return [*lines[:first], *lines[start : end + 1], *lines[first:start], *lines[end + 1 :]]
 
 
-def _operate_nodes(m: Manifest) -> list[str]:
-    if not m.operate:
-        return []
-    return [
-        "",
-        "# [nodes.operate]  # values that the plant's own operator sets: ranges, uses, limits",
-        *(
-            f"# {_text(e.name)} = {_text(_id('Operate', e.name))}  # {e.low:g} .. {e.high:g} {plain(e.unit)}".rstrip()
-            for e in m.operate
-        ),
-        "",
-        "# [operate]  # values that the loop begins with, in place of the law's own",
-        f"# {_text(m.operate[0].name)} = {m.operate[0].default:g}",
-    ]
-
-
-def _fresh(m: Manifest) -> list[str]:
-    if "fresh" not in m.inputs:
-        return []
-    return [
-        "",
-        "[fresh]  # a PV whose reading alone is bad",
-        f"bridge_s = {BRIDGE_PERIODS * m.period_s:g}  # [s] for which the law predicts it; then it is left out",
-        f"# critical = [{_text(m.pv[0].name)}]  # without these the loop holds then",
-    ]
-
-
-def _id(group: str, name: str) -> str:
-    return f"nsu=urn:loopwright:plant;s={group}.{name}"
-
-
-def _key(name: str) -> str:
-    bare = name.replace("_", "").replace("-", "")
-    return name if bare.isascii() and bare.isalnum() else _text(name)
-
-
-def _text(value: str) -> str:
-    """A text of TOML: a quote, a backslash or a line break in it ends neither the text nor the line."""
-    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
-
-
 def _node(group: str, s: Signal) -> str:
-    return f"{_key(s.name)} = {_text(_id(group, s.name))}  # {_words(s)}"
+    return f"{key_of(s.name)} = {text_of(node_id(group, s.name))}  # {_words(s)}"
 
 
 def _table(signals: Sequence[Signal], value: Callable[[Signal], float]) -> str:
-    return "{ " + ", ".join(f"{_key(s.name)} = {value(s):g}" for s in signals) + " }"
+    return "{ " + ", ".join(f"{key_of(s.name)} = {value(s):g}" for s in signals) + " }"
 
 
 def _words(s: Signal) -> str:

@@ -39,12 +39,13 @@ from loopwright.serving.station.build_loop import (
 )
 from loopwright.serving.station.control import Answer, Control
 from loopwright.serving.station.housekeeping import LinePrinter, PeriodicTask
+from loopwright.serving.station.last_run import Steered
 from loopwright.serving.station.mv_lock import Lease, Locks
 from loopwright.serving.station.plant_side import PlantSide, shown_values
 from loopwright.serving.station.recorder import MonitorRunner, Recorder
 from loopwright.serving.station.requests import Change, Request, change
 from loopwright.serving.station.settings import Settings
-from loopwright.serving.station.views import Snapshot, about, picture, state
+from loopwright.serving.station.views import VIEWS, Snapshot
 from loopwright.serving.trust import Controller as TrustedController
 from loopwright.serving.trust import ending, judged, signer
 from loopwright.serving.words import first_line
@@ -108,6 +109,7 @@ class Station:
         except BaseException:
             self.lease.release()
             raise
+        self._steered = Steered.before(settings.journal.file)
         self.recorder = Recorder(self.journal, tell, settings.speed)
         self.recorder.end_old_alarms()
         self.locks = Locks(self.lease, self.recorder)
@@ -185,6 +187,8 @@ class Station:
             unproven = judged(m).words if s.start == "AUTO" else ""
             accepted = f"accepted though {unproven}" if unproven else ""
             self.recorder.note("change", "loop.toml", f"started in {s.start}{by}", accepted)
+            again = self._steered.restore if s.restore else self._steered.compare
+            again(self.loop, lambda what, reason: self.recorder.note("change", "loop.toml", what, reason))
             report = self.loop.run(n, before=self._before, observe=self._observe, stop=lambda: self.ended)
             self.recorder.note("change", "loop", "ended")
             return report
@@ -262,12 +266,17 @@ class Station:
             self.endpoint.serve(self.loop.controller.manifest)
         if not np.isnan(command.mv).any():
             self._left_at = command.mv
+        steered = Steered.of(self.loop)
+        if steered != self._steered:
+            self._steered = steered
+            steered.keep(self.journal)
         try:
             self.recorder.scan(self.loop, sample, command)
-            self.watching.seen(stepped, seen)
+            operate = np.asarray(self.loop.operate) if self.loop.controller is stepped else None
+            self.watching.seen(stepped, seen, operate)
         finally:  # a scan that cannot be written down is a scan
             counts = self._missed_periods, self._faults
-            self.snapshot = Snapshot.of(self.loop, self.watching.monitor, seen, stepped, counts)
+            self.snapshot = Snapshot.of(self.loop, self.watching, seen, stepped, counts, self.snapshot)
         for show in self._watchers:
             show(sample, command)
 
@@ -296,8 +305,8 @@ class Station:
 
     def answer(self, tree: Any) -> Answer:
         """The answer to a request, from any thread: a view, or the change once a scan has carried it out."""
-        if isinstance(tree, dict) and tree.get("do") in {"state", "about", "picture"}:
-            return self._view(str(tree["do"]))
+        if isinstance(tree, dict) and isinstance(tree.get("do"), str) and tree["do"] in VIEWS:
+            return VIEWS[tree["do"]](self)
         request = Request.read(tree)
         if self.settings.accept_unproven:
             request = replace(request, accept_unproven=True)
@@ -316,12 +325,6 @@ class Station:
         if refused:
             raise LoopError(refused)
         return {"done": wanted.what}
-
-    def _view(self, name: str) -> Answer:
-        if name == "picture":
-            path = picture(self.active_controller)
-            return {"file": None if path is None else str(path.absolute())}
-        return about(self) if name == "about" else state(self)
 
     def _acknowledge(self, request: Request) -> Answer:
         """Write down who has seen an alarm."""

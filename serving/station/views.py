@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from loopwright.serving.active_controller import LawInputs
+from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.controller import Controller
+from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample
 from loopwright.serving.journal import columns
 from loopwright.serving.loop import Command, ControlLoop
-from loopwright.serving.monitor import Monitor, Verdict
+from loopwright.serving.monitor import Verdict
+from loopwright.serving.monitor.weekly_report import shares
 from loopwright.serving.opcua.values import words
 from loopwright.serving.trust import judged, signer
 from loopwright.serving.words import plain_tree
 
 if TYPE_CHECKING:
+    from loopwright.serving.station.recorder import MonitorRunner
     from loopwright.serving.station.station import Station
 
 View = dict[str, Any]
 
 SILENT_PERIODS = 3  # without a scan: the loop counts as dead
+MOST_OPERATED = 300  # changes of operate that the trends draw as ranges: a shift has some ten
 PICTURES = ("{stem}.png", "figures/closed_loop_{stem}.png")
 
 
@@ -45,27 +51,45 @@ class Snapshot:
     missed: int  # periods
     faults: int  # scans
     operate: tuple[float, ...]  # as operators want it of the controller in charge
+    operated: tuple[tuple[float, tuple[float, ...]], ...]  # since when these and earlier values of it hold
+    inputs: LawInputs | None  # of the last step of the controller in charge
+    stepped_s: float  # since 1970, when that was
+    courses: Mapping[str, tuple[float, float]]  # last point of each: time [s] from the next scan on, value
     verdicts: tuple[Verdict, ...]
     numbers: Mapping[str, float]
+    week: str  # that the counts are of
+    counts: Mapping[str, float]
 
     @classmethod
     def of(
         cls,
         loop: ControlLoop,
-        monitor: Monitor,
+        watching: MonitorRunner,
         seen: tuple[Sample | None, Command, float],
         stepped: Controller,
         counts: tuple[int, int],
+        before: Snapshot | None = None,
     ) -> Self:
-        """After a scan ``seen``, by the controller ``stepped``; ``counts``: periods missed, scans with a fault."""
+        """After a scan ``seen``, by the controller ``stepped``; ``counts``: periods missed, scans with a fault.
+
+        ``before`` is the snapshot of the scan before it.
+        """
         sample, command, seen_s = seen
         new = loop.successor
         successor = None
         if new is not None:
             successor = {**_named(new.controller), "good": new.good, "trial": new.trial, "reason": new.reason}
-        told = tuple(monitor.verdicts()), monitor.numbers()
+        monitor, weekly = watching.monitor, watching.weekly
         operate = tuple(map(float, loop.operate))
-        return cls(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts, operate, *told)
+        operated = () if before is None or before.controller is not loop.controller else before.operated
+        if not operated or operated[-1][1] != operate:
+            operated = (*operated[1 - MOST_OPERATED :], (seen_s, operate))
+        stepped_s = seen_s if command.law_mv is not None or before is None else before.stepped_s
+        of = (seen_s, sample, command, loop.controller, stepped, successor, loop.replaced)
+        verdicts, numbers = tuple(monitor.verdicts()), monitor.numbers()
+        week = (weekly.week, dict(weekly.counts))
+        now = (loop.stepped, stepped_s, loop.courses.ends)
+        return cls(*of, *counts, operate, operated, *now, verdicts, numbers, *week)
 
 
 def about(station: Station) -> View:
@@ -80,6 +104,9 @@ def about(station: Station) -> View:
         "signals": {name: [s.to_dict() for s in signals] for name, signals in groups.items()},
         "info": list(m.info),
         "operate": [{"name": e.name, **e.to_dict()} for e in m.operate],
+        "operated": [] if station.snapshot is None else [[at, list(of)] for at, of in station.snapshot.operated],
+        "bridge_s": BRIDGE_PERIODS * m.period_s if (of := station.settings.fresh.bridge_s) is None else of,
+        "ahead": None if m.ahead is None else m.ahead.to_dict(),
         "columns": columns(m),
         "card": _card(controller),
         "folder": str(controller.path.absolute().parent),
@@ -123,8 +150,11 @@ def state(station: Station) -> View:
         "dv": _plain(None if sample is None else sample.dv),
         "info": _plain(command.info if seen.stepped is seen.controller else None),  # of the names in ``about``
         "operate": list(seen.operate),  # of the names in ``about``
+        "courses": {name: {"ends_in_s": at, "at": value} for name, (at, value) in seen.courses.items()},
         "bridged": dict(command.bridged),
         "shed": dict(command.shed),
+        "unread_s": None if seen.inputs is None else _plain(seen.inputs.unread_s),
+        "local": dict(command.local),
         "quality": [] if sample is None else [words(status) for status in sample.quality],
         "sha256": seen.controller.sha256,
         "successor": seen.successor,
@@ -137,7 +167,26 @@ def state(station: Station) -> View:
         "faults": seen.faults,
         "verdicts": [asdict(v) for v in seen.verdicts],
         "numbers": dict(seen.numbers),
+        "week": {"began": seen.week, **shares(seen.counts)},
         "warnings": station.ending(),
+    }
+
+
+def inputs(station: Station) -> View:
+    """Inputs of the last step of the controller in charge, and its file: for who computes that step again.
+
+    LoopError before the first one.
+    """
+    seen = station.snapshot
+    if seen is None or seen.inputs is None:
+        raise LoopError("the law in charge has not been stepped yet: nothing is known of its next moves")
+    m = station.manifest
+    return {
+        "time": seen.stepped_s,
+        "file": str(seen.controller.path.absolute()),
+        "sha256": seen.controller.sha256,
+        "signals": {name: [s.name for s in m.signals(name)] for name in ("pv", "dv")},
+        "inputs": {name: value.tolist() for name, value in seen.inputs.values.items()},
     }
 
 
@@ -182,3 +231,16 @@ def picture(controller: Controller) -> Path | None:
         if path.is_file():
             return path
     return None
+
+
+def _pictured(station: Station) -> View:
+    path = picture(station.active_controller)
+    return {"file": None if path is None else str(path.absolute())}
+
+
+VIEWS: Mapping[str, Callable[[Station], View]] = {
+    "about": about,
+    "state": state,
+    "inputs": inputs,
+    "picture": _pictured,
+}

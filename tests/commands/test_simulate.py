@@ -94,13 +94,53 @@ def test_a_simulation_has_the_operate_that_is_asked_for(
 
     assert highest() > 300
     assert highest("--operate", "T_j.high=280", "--operate", "speed=2") == 280
-    for file, value in ((steered_file, "T_j.high=900"), (steered_file, "T_j.top=1"), (pid_file, "T_j.high=280")):
+    twice = ("T_j.high=280", "--operate", "T_j.high=290")
+    for file, value in (
+        (steered_file, ("T_j.high=900",)), (steered_file, ("T_j.top=1",)), (pid_file, ("T_j.high=280",)),
+        (steered_file, twice), (steered_file, ("T_j.high=900@5",)), (pid_file, ("T_j.high=280@5",)),
+    ):  # fmt: skip
         capsys.readouterr()
-        assert main(["simulate", str(file), "--operate", value]) == 2
+        assert main(["simulate", str(file), "--sp", "0.5", "--operate", *value]) == 2
         said = capsys.readouterr().err
         assert said.startswith("loopwright simulate: ")
         assert "operate" in said
         assert said.count("\n") == 1
+
+
+def test_a_course_is_known_before_it_comes(
+    plant: EquationPlant, pid_file: Path, tmp_path_factory: pytest.TempPathFactory, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The set point follows the file, and the MV of a law that reads it moves before it does."""
+    path, model = tmp_path_factory.mktemp("controllers") / "course.onnx", parts(plant)["identified"]
+    law = Predictive(plant.signals, model, Predictive.Params(horizon=20, preview="course")).eval()
+    export(law, path, case=CASE, provenance={})
+    Path("recipe.csv").write_text("time,C_A\n10,0.6\n15,0.55\n")
+    plain = simulate(path, "--sp", "0.5", "--duration", "20")
+    rows = simulate(path, "--sp", "0.5", "--duration", "20", "--course", "recipe.csv")
+    np.testing.assert_array_equal(column(rows, "SP C_A [mol/l]"), np.repeat([0.5, 0.6, 0.55], [20, 10, 10]))
+    moved = np.abs(column(rows, "T_j [K]") - column(plain, "T_j [K]"))
+    assert moved[:20].max() > 0.1
+    for words in ([str(pid_file), "--course", "recipe.csv"], [str(path), "--straight", "C_A"]):
+        capsys.readouterr()
+        assert main(["simulate", *words, "--sp", "0.5", "--duration", "20"]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_operators_change_something_while_it_runs(steered_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = simulate(steered_file, "--sp", "0.5", "--duration", "40")
+    capsys.readouterr()
+    changed = ("T_j.high=280@10", "C_A.track=0@20", "C_A.low=0.6@20", "T_j.cost=1@20")
+    options = [word for value in changed for word in ("--operate", value)]
+    rows = simulate(steered_file, "--sp", "0.5", "--duration", "40", *options)
+    before = column(rows, "time_s") < 10
+    mv, usual = column(rows, "T_j [K]"), column(plain, "T_j [K]")
+    assert mv[before].tolist() == usual[before].tolist()
+    assert mv[~before].max() <= 280 < usual[~before].max()
+    out = capsys.readouterr().out
+    lines = [line for line in out.splitlines() if line.startswith(("C_A follows", "C_A outside", "T_j at", "profit "))]
+    assert [line.split()[0] for line in lines] == ["C_A", "C_A", "T_j", "profit"]
+    assert "50 %" in lines[0]
+    assert "outside 0.6" in lines[1]
 
 
 def test_set_points_disturbance_and_manual_happen_when_asked(

@@ -146,6 +146,20 @@ def test_of_two_ranges_at_odds_the_one_of_the_higher_rank_is_kept(first: str, se
     assert not mv[:, 1:].any()
 
 
+@pytest.mark.parametrize("seed", [3, 12])
+def test_of_two_set_points_at_odds_the_one_that_weighs_less_gives_way(seed: int) -> None:
+    """One MV is left for both."""
+    plant = random_model(seed, n_y=2, n_mv=2, n_hidden=0)
+    errors = []
+    for more in ({}, {"y0.weight": 10.0, "y1.weight": 0.1}, {"y0.weight": 0.1, "y1.weight": 10.0}):
+        law = law_of(plant, horizon=20, operate={"u1.use": False, **more})
+        y, _, _ = closed(law, plant, np.tile([0.15, -0.1], (120, 1)))
+        errors.append(np.abs(y[-1] - [0.15, -0.1]))
+    assert errors[1][0] < 0.1 * errors[0][0]
+    assert errors[2][1] < 0.1 * errors[0][1]
+    assert errors[1][1] > errors[0][1]
+
+
 # ------------------------------------------------------------------------------------------------ manipulated variables
 @given(seeds)
 @few

@@ -1,19 +1,24 @@
-"""The last lines of a simulated run: an MV that rests at its end while an error stays is named."""
+"""The last lines of a simulated run: MVs at their ends, travel, and what operators asked for."""
 
 from __future__ import annotations
+
+import re
 
 import numpy as np
 import pytest
 from identified_models import made_signals
 
+from loopwright.pipeline.laws.predictive.operating import entries_of
 from loopwright.pipeline.pictures.loop_picture import History, summary
+from loopwright.pipeline.pictures.operated_summary import operated_lines
+from loopwright.serving.operating import Operate
 
 
 class Plant:
     """A plant of which only the signals matter."""
 
     signals = made_signals(1, 2)
-    sp_signals, pv_signals, mv_signals = signals.sp, signals.pv, signals.mv
+    sp_signals, pv_signals, mv_signals, period_s = signals.sp, signals.pv, signals.mv, 1.0
 
 
 def said(error: float, mv: list[float]) -> str:
@@ -40,3 +45,71 @@ def test_an_error_that_stays_names_the_mvs_at_their_ends() -> None:
 @pytest.mark.parametrize(("error", "mv"), [(0.0, [1.0, 0.0]), (0.5, [0.9, 0.0])])
 def test_nothing_is_said_where_the_error_goes_or_the_mvs_have_room(error: float, mv: list[float]) -> None:
     assert "out of reach" not in said(error, mv)
+
+
+# ------------------------------------------------------------------------------------------------- operators' changes
+ENTRIES = entries_of(Plant.signals, 1, [], [], {})
+N = 20
+
+
+def steered(*changes: tuple[int, dict[str, float]], mv0: float = 0.0) -> History:
+    """A PV that stands at 1, with a set point at 0, and MVs at .2 and .4; operators change something."""
+    operate, now = [], Operate(ENTRIES).default
+    for k in range(N):
+        for at, values in changes:
+            now = Operate(ENTRIES).with_values(values, now) if at == k else now
+        operate.append(now)
+    pv, mv = [np.array([1.0])] * N, [np.array([0.2, 0.4])] * N
+    return History([float(k) for k in range(N)], ["AUTO"] * N, [np.array([0.0])] * N, pv, pv, mv, [""] * N,
+                   np.array([mv0, 0.4]), ENTRIES, operate)  # fmt: skip
+
+
+def lines(history: History, noise: float = 0.0) -> list[str]:
+    return list(operated_lines(Plant(), history, np.array([noise])))  # type: ignore[arg-type]
+
+
+def numbers(line: str) -> list[float]:
+    return [float(n) for n in re.findall(r"(?<![a-z\d])-?\d+\.?\d*", line)]
+
+
+def test_the_first_move_counts_as_travel() -> None:
+    for mv0, travel in ((0.2, 0.0), (-0.3, 0.5)):
+        (line,) = [of for of in summary(Plant(), steered(mv0=mv0)).splitlines() if of.startswith("travel of u0")]  # type: ignore[arg-type]
+        assert float(line.split()[3]) == pytest.approx(travel)
+
+
+def test_errors_count_while_a_set_point_is_followed() -> None:
+    def of(*changes: tuple[int, dict[str, float]]) -> list[str]:
+        return [line for line in summary(Plant(), steered(*changes)).splitlines() if "y0" in line]  # type: ignore[arg-type]
+
+    assert [line.startswith("MAE y0 1 m") for line in of()] == [True]
+    let_go, error = of((5, {"y0.track": 0.0}))
+    assert numbers(let_go)[-1] == 75
+    assert error.startswith("MAE y0 1 m")
+    assert len(of((0, {"y0.track": 0.0}))) == 1  # there is no error to be told
+
+
+def test_nothing_is_said_of_a_law_without_operate_or_of_one_that_nobody_steered() -> None:
+    plain = History([0.0], ["AUTO"], [np.zeros(1)], [np.ones(1)], [np.ones(1)], [np.zeros(2)], [""])
+    assert lines(plain) == []
+    assert lines(steered()) == []
+
+
+def test_a_range_tells_its_time_outside_and_by_how_much_from_when_it_is_set() -> None:
+    (line,) = lines(steered((0, {"y0.high": 2.0}), (15, {"y0.high": 0.6})))
+    assert "25 % of the time" in line
+    assert "0.4 m at most" in line
+    assert "0 % of the time" in lines(steered((0, {"y0.high": 0.6})), noise=0.5)[0]  # noise may hide it
+    assert lines(steered((0, {"y0.high": 0.6, "y0.use": 0.0}))) == []
+
+
+def test_mvs_tell_limits_rests_and_uses_and_costs_a_profit() -> None:
+    said = lines(
+        steered((0, {"u0.high": 0.2, "u1.rest": 0.5, "u1.rest_use": 1.0}), (10, {"u1.use": 0.0, "u0.cost": 2.0}))
+    )
+    by_word = {line.split()[0]: line for line in said}
+    assert "100 % of the time" in by_word["u0"]
+    assert [line for line in said if "out of use for 50 %" in line]
+    assert [line for line in said if "0.1 V from its resting value 0.5 V" in line]
+    # Half of the run at .2 * 2 a period of 1 s.
+    assert numbers(by_word["profit"]) == pytest.approx([-3600 * 0.2, -3600 * 0.4])

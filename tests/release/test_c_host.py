@@ -29,6 +29,7 @@ from kits import (
     refuses_an_old_kit,
     refuses_in_one_line,
     scans_of_a_loop,
+    takes_what_is_to_come,
     takes_what_operators_change,
     verdict_on,
     wrong_file,
@@ -38,7 +39,7 @@ CMAKE = shutil.which("cmake")
 if CMAKE is None or shutil.which("cc") is None:
     pytest.skip("cmake or a C compiler is missing (apt install cmake gcc)", allow_module_level=True)
 
-pytest_plugins = ["small_laws", "operated_laws"]
+pytest_plugins = ["small_laws", "operated_laws", "course_files"]
 SANITIZERS = "-O1 -g -Werror -fsanitize=address,undefined -fno-sanitize-recover=all"
 
 
@@ -93,6 +94,10 @@ def test_c_gives_the_bits_of_our_runtime(host: Path, file: Path, tmp_path: Path)
 
 def test_c_refuses_results_and_takes_measured_disturbances(host: Path, disobedient_file: Path, tmp_path: Path) -> None:
     answers_refusals_and_disturbances(partial(run, host), disobedient_file, tmp_path / "answers.json")
+
+
+def test_c_takes_what_is_to_come(host: Path, course_file: Path, tmp_path: Path) -> None:
+    takes_what_is_to_come(partial(run, host), course_file, tmp_path / "answers.json")
 
 
 def test_c_takes_what_operators_change(host: Path, operated_file: Path, tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ if MISSING:
     pytest.skip(MISSING, allow_module_level=True)
 fmpy = pytest.importorskip("fmpy")
 
-pytest_plugins = ["small_laws", "operated_laws"]
+pytest_plugins = ["small_laws", "operated_laws", "course_files"]
 PID = "thiosulfate_cstr/pid"
 # Laws with and without state, read-back and network; several MVs, one of set values.
 # The law's part is the same C in both versions, so only some are played in both.
@@ -137,6 +137,26 @@ def test_an_fmu_takes_what_operators_change(operated: tuple[Controller, Path]) -
         assert (float(v.min), float(v.max), float(v.start), v.unit or "") == (e.low, e.high, e.default, e.unit)
         assert (v.causality, v.variability) == ("parameter", "tunable")
         assert v.description
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_takes_what_is_to_come(previewing: Controller, tmp_path: Path, fmi: int) -> None:
+    write_folder(previewing, tmp_path, fmi, tools())
+    assert problems(tmp_path) == []
+    ahead = previewing.manifest.ahead
+    assert ahead is not None
+    with closing(Unit(tmp_path)) as u:
+        wanted = [f"ahead.{s.group}.{s.signal}.{i}" for i in range(1, ahead.horizon + 1) for s in ahead.signals]
+        assert u.names("ahead") == wanted
+        seen = compared(previewing, answered(previewing), u)
+        assert seen[""] > 300
+        u.reset()
+        u.begin()
+        u.set(ahead=np.full(ahead.size, 9.0))
+        u.step(previewing.manifest.period_s)
+        assert u.fault  # refused, and not clipped
+    v = {v.name: v for v in fmpy.read_model_description(str(tmp_path)).modelVariables}["ahead.dv.d0.1"]
+    assert (float(v.min), float(v.max), float(v.start), v.causality) == (-2.0, 2.0, 0.0, "input")
 
 
 def test_without_a_value_an_fmu_has_the_defaults_and_all_is_fresh(operated: tuple[Controller, Path]) -> None:

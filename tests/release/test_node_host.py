@@ -25,6 +25,7 @@ from kits import (
     refuses_an_old_kit,
     refuses_in_one_line,
     scans_of_a_loop,
+    takes_what_is_to_come,
     takes_what_operators_change,
     verdict_on,
     wrong_file,
@@ -34,7 +35,7 @@ NODE = shutil.which("node")
 if NODE is None or not (EMBED / "node" / "node_modules").is_dir():
     pytest.skip("node or its packages are missing (npm ci in examples/embed/node)", allow_module_level=True)
 
-pytest_plugins = ["small_laws", "operated_laws"]
+pytest_plugins = ["small_laws", "operated_laws", "course_files"]
 
 
 def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -81,6 +82,10 @@ def test_node_gives_the_bits_of_our_runtime(file: Path, conformed: dict[Path, tu
 
 def test_node_refuses_results_and_takes_measured_disturbances(disobedient_file: Path, tmp_path: Path) -> None:
     answers_refusals_and_disturbances(run, disobedient_file, tmp_path / "answers.json")
+
+
+def test_node_takes_what_is_to_come(course_file: Path, tmp_path: Path) -> None:
+    takes_what_is_to_come(run, course_file, tmp_path / "answers.json")
 
 
 def test_node_takes_what_operators_change(operated_file: Path, tmp_path: Path) -> None:

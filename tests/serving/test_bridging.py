@@ -101,7 +101,7 @@ def test_the_loop_holds_where_no_controlled_variable_is_left(operated: Controlle
     for _ in range(BRIDGE):
         assert loop.scan(sample(t=NAN, p=-9.0)).mode is Mode.AUTO
     for _ in range(3):
-        assert held(loop.scan(sample(t=NAN, p=-9.0)), "PV T")
+        assert held(loop.scan(sample(t=NAN, p=-9.0)), "PV T, PV p")
     assert loop.scan(sample(t=NAN)).mode is Mode.HOLD  # a good sample is one that the law may act on
     command = loop.scan(sample(t=NAN))
     assert (command.mode, list(command.shed)) == (Mode.AUTO, ["T"])
@@ -144,7 +144,7 @@ def test_a_pv_that_was_never_read_is_not_bridged(operated: Controller) -> None:
     [
         sample(fault="the plant's watchdog stands"),
         sample(age_s=5.0),
-        sample(valve=NAN),
+        sample(mv_applied=np.array([40.0, NAN])),  # an MV that this law cannot do without
         sample(mv_applied=np.array([40.0])),
         sample(pv=np.array([300.0, 5.0])),
         sample(bad_pv=("bad",)),
@@ -218,7 +218,7 @@ def test_a_jump_is_not_forgotten_over_a_fault_of_the_whole_sample(operated: Cont
     loop = rated(operated)
     loop.scan(sample())
     assert loop.scan(sample(t=380.0)).bridged
-    assert loop.scan(sample(t=380.0, valve=NAN)).mode is Mode.HOLD
+    assert loop.scan(sample(t=380.0, mv_applied=np.array([40.0, NAN]))).mode is Mode.HOLD
     loop.miss("the plant cannot be read")
     assert list(loop.scan(sample(t=380.0)).bridged) == ["T"]
     assert not loop.scan(sample(t=310.0)).bridged
@@ -377,3 +377,13 @@ def test_whatever_is_read_the_law_gets_good_numbers_and_bad_ones_are_named(opera
         assert seen.pv == last
         assert {n for n, fresh in seen.fresh.items() if not fresh} == bad
         assert {n for n in ("T", "p") if not seen.operate[f"{n}.use"]} == set(command.shed)
+
+
+@pytest.mark.parametrize("critical", [(), ("T", "p")], ids=["none left", "critical"])
+def test_hold_names_every_pv_that_is_missing(operated: Controller, critical: tuple[str, ...]) -> None:
+    loop = loop_of(operated, critical=critical)
+    loop.scan(sample())
+    command = [loop.scan(sample(t=NAN, p=NAN)) for _ in range(BRIDGE + 1)][-1]
+    assert command.mode is Mode.HOLD
+    assert "PV T" in command.fault
+    assert "PV p" in command.fault

@@ -83,7 +83,15 @@ def test_a_fault_that_passes_from_one_signal_to_another_is_told(make: Any, tmp_p
     loop: Any = SimpleNamespace(controller=controller, successor=None)
     for reason in (make("TIC-101"), make("TIC-101"), make("TIC-102"), ""):
         command: Any = SimpleNamespace(
-            sp=(), mv=(), writes=False, law_mv=None, successor_mv=None, info=None, fault=reason, mode=Mode.HOLD
+            sp=(),
+            mv=(),
+            writes=False,
+            law_mv=None,
+            successor_mv=None,
+            info=None,
+            fault=reason,
+            mode=Mode.HOLD,
+            local={},
         )
         recorder.scan(loop, None, command)
     journal.close()

@@ -26,7 +26,7 @@ from loopwright.serving.journal import EventEntry, Journal, JournalReader, ScanE
 from loopwright.serving.journal.entries import EVENT, Kind, packed, unpacked
 from loopwright.serving.journal.file import TABLES
 from loopwright.serving.journal.writer import BLOCK_SCANS, EVENT_SLACK, FRESH, LEAST_EVENTS, shorten_events
-from loopwright.serving.page import app
+from loopwright.serving.page.prometheus import metrics_text
 from loopwright.serving.station.recorder import Recorder
 
 pytest_plugins = ["small_laws"]
@@ -726,4 +726,4 @@ def test_the_metrics_tell_what_the_journal_lost() -> None:
     about = {"card": {"law": "pi", "case": "tank", "sha256": "0", "file": "pi.onnx"}, "info": [],
              "signals": {name: [] for name in ("sp", "pv", "mv", "dv")}}  # fmt: skip
     state = {"alive": True, "mode": "AUTO", "time": 1.0, "journal": "", "journal_lost": 32}
-    assert "loopwright_journal_lost_total 32.0" in app.metrics_text(about, state).splitlines()
+    assert "loopwright_journal_lost_total 32.0" in metrics_text(about, state).splitlines()

@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from operated_law import FASTEST, Given
 
 from loopwright.serving import Controller, ControlLoop, LoopError, Mode, Sample
+from loopwright.serving.errors import ContractError
+from loopwright.serving.fields import nearest
 from loopwright.serving.manifest import SWITCHES
+from loopwright.serving.operating import Operate
 
 pytest_plugins = ["small_laws", "operated_files"]
 
@@ -281,3 +284,54 @@ def test_no_mv_leaves_the_operators_range_or_is_faster_than_operators_let_it(
                 loop.set_mode(Mode.AUTO)
             plant.write(command.mv)
             plant_mv = plant.mv
+
+
+# ------------------------------------------------------------------------------------------------ words and switches
+def test_a_switch_may_be_true_or_false(operated: Controller) -> None:
+    loop = loop_of(operated)
+    loop.set_operate({"valve.use": False, "T.use": np.False_, "p.use": True})
+    assert [named(loop)[n] for n in ("valve.use", "T.use", "p.use")] == [0.0, 0.0, 1.0]
+    operate = Operate(operated.manifest.operate)
+    mixed = [bool(v) if e.what in SWITCHES else v for e, v in zip(operate.entries, operate.default, strict=True)]
+    given: dict[str, Any] = {"sp": [300.0, 5.0], "pv": [299.0, 5.0, 0.5], "mv_applied": [40.0, 0.5]}
+    steps = [
+        operated.step(**given, state=operated.cold_state(), operate=values, fresh=fresh)
+        for values, fresh in ((mixed, [True, False, True]), (None, [1, 0, 1]), (None, np.array([True, False, True])))
+    ]
+    assert steps[0].info.tolist() == steps[1].info.tolist() == steps[2].info.tolist()
+    with pytest.raises(ContractError, match="operate"):
+        operated.step(**given, state=operated.cold_state(), operate=[True] * len(mixed))
+
+
+@pytest.mark.parametrize(("name", "value"), [("operate", np.ones(9)), ("fresh", [1, 1, 1])])
+def test_a_law_without_these_inputs_refuses_them(not_operated: Controller, name: str, value: Any) -> None:
+    given: dict[str, Any] = {"sp": [300.0, 5.0], "pv": [299.0, 5.0, 0.5], "mv_applied": [40.0, 0.5], name: value}
+    with pytest.raises(ContractError, match=name) as error:
+        not_operated.step(**given, state=not_operated.cold_state())
+    assert "\n" not in str(error.value)
+
+
+def test_values_that_are_right_stay_right_and_others_are_refused_each_time(operated: Controller) -> None:
+    operate = Operate(operated.manifest.operate)
+    right = operate.with_values({"valve.high": 60.0})
+    for _ in range(2):
+        assert operate.checked(right) is right
+        wrong = right.copy()
+        wrong[operate.places["valve.high"]] = 600.0
+        with pytest.raises(ContractError, match="high"):
+            operate.checked(wrong)
+
+
+@given(st.integers(0, 999), st.floats(0.0, 1.0))
+def test_drawn_values_are_allowed(operated: Controller, seed: int, share: float) -> None:
+    operate = Operate(operated.manifest.operate)
+    drawn = operate.drawn(np.random.default_rng(seed), share)
+    assert operate.checked(drawn).tolist() == drawn.tolist()
+
+
+def test_many_names_are_shortened_to_the_nearest() -> None:
+    many = [f"TIC-{i}.{what}" for i in range(20) for what in ("use", "low", "high")]
+    words = nearest("TIC-7.hihg", many)
+    assert "TIC-7.high" in words
+    assert sum(name in words.split(", ") or name in words for name in many) < 20
+    assert all(name in nearest("lwo", ["low", "high"]) for name in ("low", "high"))

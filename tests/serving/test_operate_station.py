@@ -69,7 +69,10 @@ def test_a_bad_pv_speaks_against_itself_alone_where_the_law_bridges_it(
     assert [bool(why) for why in found.bad_pv] == [True, False, True]
     assert "BadSensorFailure" in found.bad_pv[0]
     assert valued(operated.manifest).bad_pv == ()
-    assert "valve" in valued(operated.manifest, T=BAD_T, valve=BAD_T).fault
+    assert "heat" in valued(operated.manifest, T=BAD_T, heat=BAD_T).fault  # the law cannot do without it
+    alone = valued(operated.manifest, valve=BAD_T)
+    assert (alone.fault, bool(alone.local[0]), alone.local[1]) == ("", True, "")
+    assert np.isnan(alone.mv[0])
     whole = valued(not_operated.manifest, T=BAD_T, valve=BAD_T)
     assert whole.fault.startswith("PV T")
     assert whole.bad_pv == ()

@@ -31,7 +31,7 @@ def test_every_public_name_is_documented() -> None:
 
 def test_a_step_takes_and_gives_what_hosts_write_down() -> None:
     step = inspect.signature(serving.Controller.step).parameters
-    assert set(step) == {"self", "sp", "pv", "dv", "mv_applied", "state", "operate", "fresh"}
+    assert set(step) == {"self", "sp", "pv", "dv", "mv_applied", "state", "operate", "fresh", "ahead"}
     assert all(step[p].kind is inspect.Parameter.KEYWORD_ONLY for p in step if p != "self")
     assert {"sp", "mv", "mode", "guards", "recover_after", "clock", "operate", "bridge_s", "critical"} <= set(
         inspect.signature(serving.ControlLoop.__init__).parameters

@@ -113,3 +113,22 @@ def test_a_read_back_that_is_no_number_is_believed_by_no_loop(given: Any, pi_fil
     assert (command.mode, command.mv.tolist()) == (Mode.HOLD, [STANDS])
     unknown = loop_on(pi_file, guards=(), mode=Mode.MANUAL)
     assert not unknown.scan(Sample(np.array([0.8, 300.0]), given, np.zeros(1))).writes
+
+
+# ------------------------------------------------------------------------------------------- a shadow that takes over
+@pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD])
+def test_a_shadow_that_takes_over_writes_the_mv_that_is_read_back_now(mode: Mode, pi_file: Path) -> None:
+    """The plant's own side moved it since the last scan; the old one would bump it back, and faster than its rate."""
+    loop = loop_on(pi_file, mode=Mode.SHADOW)
+    loop.scan(sample())
+    loop.set_mode(mode)
+    assert loop.scan(sample(mv=STANDS + 8)).mv.tolist() == [STANDS + 8]
+    assert loop.scan(sample(mv=STANDS + 9)).mv.tolist() == [STANDS + 8]  # from then on it is the loop's
+
+
+def test_what_the_operator_sets_by_hand_as_a_shadow_ends_is_written(pi_file: Path) -> None:
+    loop = loop_on(pi_file, mode=Mode.SHADOW)
+    loop.scan(sample())
+    loop.set_mode(Mode.MANUAL)
+    loop.set_mv([20.0])
+    assert loop.scan(sample(mv=STANDS + 8)).mv.tolist() == [20.0]

@@ -16,6 +16,7 @@ from processes import within
 from loopwright.serving import Command, Controller, Mode
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.monitor import Monitor, Verdict
+from loopwright.serving.monitor.weekly import WeeklyCounts
 from loopwright.serving.station.recorder import MonitorRunner, Recorder
 from loopwright.serving.station.station import Station
 
@@ -105,7 +106,7 @@ def station_that(did: list[str], write: Callable[..., object]) -> Station:
         _moved=lambda loop: None,
         scans=0, _faults=0, _missed_periods=0, _watchers=[lambda *_: did.append("others")], snapshot=None,
         recorder=SimpleNamespace(controller=controller, scan=write),
-        watching=SimpleNamespace(seen=lambda *_: did.append("monitor"), monitor=monitor),
+        watching=SimpleNamespace(seen=lambda *_: did.append("monitor"), monitor=monitor, weekly=WeeklyCounts()),
     ))  # fmt: skip
 
 

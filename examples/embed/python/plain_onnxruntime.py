@@ -18,6 +18,8 @@ for k in range(100):  # once every m["period_s"] seconds
     given = {n: np.array([(s["low"] + s["high"]) / 2 for s in m[n]]) for n in ("sp", "dv")}
     pv = np.array([s["low"] + (s["high"] - s["low"]) * (k % 10) / 10 for s in m["pv"]])
     given |= {"pv": pv, "mv_applied": mv, "state": state, "operate": np.array(operate), "fresh": np.ones(len(pv))}
+    if "ahead" in m:  # what is to come of set points and disturbances: nothing
+        given["ahead"] = np.zeros(m["ahead"]["horizon"] * len(m["ahead"]["signals"]))
     result = dict(zip(names, session.run(None, {n: given[n] for n in m["inputs"]}), strict=True))
     old, mv, state, info = mv, result["mv"], result.get("state_next", state), result.get("info", np.zeros(0))
     allowed = (low <= mv) & (mv <= high) & (abs(mv - old) <= most * (1 + 1e-9))  # the runtime also checks the file

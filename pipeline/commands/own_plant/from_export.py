@@ -9,16 +9,17 @@ from functools import cache
 from pathlib import Path
 
 from loopwright.pipeline.commands.own_plant.knowledge import Widening
+from loopwright.pipeline.commands.own_plant.number_options import limited, numbers_given
 from loopwright.pipeline.config.exports import ExportParams, TimeSpan
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.cleaning.findings import counted
 from loopwright.pipeline.historian.cleaning.tags import (
     EXPLAINED,
+    PV_ROLES,
     ROLES,
     Tag,
     as_it_is,
     check_tags,
-    limited,
     parse_tag,
     read_tags,
     write_tags,
@@ -32,7 +33,7 @@ from loopwright.serving.words import plain
 def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
     """The tags that a person gave, and where they stand."""
     known = cache(lambda: tags_in(options.files))
-    given = tuple(parse_tag(text, role, known) for role in ROLES for text in getattr(options, role))
+    given = tuple(parse_tag(text, role, known) for role in ROLES for text in getattr(options, role.replace("-", "_")))
     if given and options.tags:
         raise RecordError("--tags and options of roles are both given; give one of them")
     # A range in an option was stated; one in a table may be as it was guessed.
@@ -40,7 +41,7 @@ def given_tags(options: argparse.Namespace) -> tuple[tuple[Tag, ...], str]:
     found, where = (read_tags(options.tags, widen), str(options.tags)) if options.tags else (given, "the options")
     if found or options.tags:
         check_tags(found, where)
-    found = limited(found, options.command, options.max_move, widen) if found else found
+    found = limited(found, numbers_given(options), widen) if found else found
     for note in widen.notes if isinstance(widen, Widening) else ():
         print(note)
     return found, where
@@ -88,7 +89,8 @@ def propose_tags(name: str, options: argparse.Namespace) -> None:
     roles = {r: [g.tag.tag for g in rows if g.tag.role == r] for r in ROLES}
     print(f"{path}: {counted(len(rows), 'tag')} with guessed roles; nothing else was written")
     for role, tags in roles.items():
-        print(plain(f"  {role:5} {', '.join(tags) or '-'}"))
+        if tags or role not in PV_ROLES or role == "pv":  # no guess makes a constraint or an analyser
+            print(plain(f"  {role:5} {', '.join(tags) or '-'}"))
     for line in loop_lines([g.tag for g in rows]):
         print(plain(f"  {line}"))
     files = " ".join(map(str, options.files))

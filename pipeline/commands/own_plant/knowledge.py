@@ -19,9 +19,10 @@ from loopwright.pipeline.records.record import Record
 from loopwright.serving.manifest import Signal
 
 
-def mvs_of(plant: Simulator) -> tuple[Tag, ...]:
-    """The MVs of a simulator that states its signals itself."""
-    return tuple(Tag(s.name, "mv", s.unit, s.low, s.high, s.name) for s in plant.mv_signals)
+def signals_of_simulator(plant: Simulator) -> tuple[Tag, ...]:
+    """The process variables and MVs of a simulator that states its signals itself."""
+    groups = (("pv", plant.pv_signals), ("mv", plant.mv_signals))
+    return tuple(Tag(s.name, role, s.unit, s.low, s.high, s.name) for role, signals in groups for s in signals)
 
 
 def check_commands(signals: Sequence[Signal], tags: Sequence[Tag]) -> None:
@@ -173,7 +174,8 @@ def signals_as_tags(of: Record | Simulator, tags: Sequence[Tag]) -> tuple[Tag, .
 def checked(known: tuple[Known, ...], tags: Sequence[Tag]) -> tuple[Known, ...]:
     """The statements; RecordError where they leave a controlled variable without an MV, or an MV without any."""
     pvs, mvs, dvs = ([t.name for t in tags if t.role == role] for role in ("pv", "mv", "dv"))
-    if wrong := mistake_of_known(known, pvs, mvs, dvs, min(len(pvs), len(mvs))):
+    controlled = sum(t.role == "pv" and not t.constraint for t in tags)
+    if wrong := mistake_of_known(known, pvs, mvs, dvs, min(controlled, len(mvs))):
         raise RecordError(wrong)
     return known
 

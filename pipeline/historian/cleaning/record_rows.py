@@ -56,8 +56,7 @@ def evenly(record: Record) -> Record:
     starts = np.linspace(0, n - RECORD_WINDOW, WINDOWED // RECORD_WINDOW).astype(np.int64)
     rows = (starts[:, None] + np.arange(RECORD_WINDOW)).ravel()
     fresh = np.r_[True, (np.diff(rows) != 1) | (np.diff(record.run[rows]) != 0)]
-    taken = {name: getattr(record, name)[rows] for name in ("time_s", "pv", "mv", "dv")}
-    return replace(record, run=np.cumsum(fresh, dtype=np.int64) - 1, **taken)
+    return record.at(rows, np.cumsum(fresh, dtype=np.int64) - 1)
 
 
 def readings_of(clock: Sequence[Series], series: Sequence[Series], step_s: float) -> dict[str, Series]:
@@ -260,9 +259,14 @@ def record_of(grid: Grid, code: NDArray[np.uint8], signals: Sequence[Tag]) -> Re
     own = {r: tuple(_signal(t, v) for t, v in zip(g, columns[r].T, strict=True)) for r, g in groups.items()}
     position = np.arange(len(run)) - np.maximum.accumulate(np.where(fresh, np.arange(len(run)), 0))
     time_s = position.astype(np.float64) * grid.period_s
-    return Record(
+    record = Record(
         grid.period_s, own["pv"], own["mv"], own["dv"], run, time_s, columns["pv"], columns["mv"], columns["dv"]
     )
+    if not grid.fresh:
+        return record
+    every_row = np.ones(len(kept), dtype=np.bool_)
+    fresh = [grid.fresh[t.tag][kept] if t.tag in grid.fresh else every_row for t in groups["pv"]]
+    return replace(record, fresh=np.column_stack(fresh))
 
 
 def _remedy(counts: NDArray[np.int64]) -> str:

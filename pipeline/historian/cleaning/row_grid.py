@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,9 +38,10 @@ class Grid:
     time_s: Array  # (n,) [s] as the export counts
     piece: NDArray[np.int64]  # (n,) number of the piece between two gaps in time
     value: dict[str, Array]  # (n,) NaN where there is no value
-    code: Mapping[str, Codes]  # (n,) why there is none; GOOD where there is one
-    bridged: Mapping[str, int]  # rows whose value was drawn or held over a bad or missing reading
+    code: dict[str, Codes]  # (n,) why there is none; GOOD where there is one
+    bridged: dict[str, int]  # rows whose value was drawn or held over a bad or missing reading
     limits: dict[str, NDArray[np.bool_]] = field(default_factory=dict)  # (n,) at its lowest or highest value
+    fresh: dict[str, NDArray[np.bool_]] = field(default_factory=dict)  # (n,) of an analyser: rows with a new reading
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -53,6 +54,11 @@ class Grid:
         code = self.code[tag]
         out = (code != 0) | self.limits[tag] if tag in self.limits else code != 0
         return np.where(out, np.nan, self.value[tag]) if out.any() else self.value[tag]
+
+    def put(self, tag: str, value: Array, fresh: NDArray[np.bool_]) -> None:
+        """An analyser's values (n,), with the rows (n,) that have a new reading: none takes a row of others away."""
+        self.value[tag], self.fresh[tag] = value, fresh
+        self.code[tag], self.bridged[tag] = np.zeros(len(self), np.uint8), 0
 
     def lighten(self, tag: str) -> None:
         """Keep single precision of a long tag: enough for what is only drawn from here on."""

@@ -9,9 +9,11 @@ import unicodedata
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from math import inf
 from pathlib import Path
 from typing import Literal
 
+from loopwright.pipeline.config.operator_defaults import OPERATED, mistakes_of_operated
 from loopwright.pipeline.config.plants import mistakes_of_mv
 from loopwright.pipeline.errors import RecordError, nearest
 from loopwright.pipeline.files import write_text
@@ -19,14 +21,21 @@ from loopwright.pipeline.historian.cleaning.findings import InputReport
 from loopwright.serving.fields import shown
 from loopwright.serving.manifest import MAX_NAME, Signal
 
-ROLES = ("pv", "mv", "dv", "sp", "mode")
+ROLES = ("pv", "constraint", "analyser", "constraint-analyser", "mv", "dv", "sp", "mode")
+PV_ROLES = {
+    "pv": (False, False),
+    "constraint": (True, False),
+    "analyser": (False, True),
+    "constraint-analyser": (True, True),
+}
+"""Roles of process variables: whether one is kept in its range alone, and whether its readings are seldom and late."""
 SIGNAL_ROLES = ("pv", "mv", "dv")
 COMMANDS = ("command_low", "command_high", "max_move_per_min")  # of an MV, for the controller
 WORDS = {"between": ("step", "line"), "ends": ("keep", "drop")}  # of columns that say how readings are taken
 GUESSED_PAD = 0.25  # of the usual span, beyond it, in the range that the table guesses
 KEEP = "write keep into column ends of the table of tags, which `loopwright new` without roles writes for --tags"
 CERTAIN = {"": False, "no": False, "yes": True}
-NUMBERS = ("low", "high", *COMMANDS)
+NUMBERS = ("low", "high", *COMMANDS, *OPERATED)
 READ_ONLY = ("step", "good_percent", "remark")
 COLUMNS = ("tag", "role", "name", "unit", "unit_certain", *NUMBERS, *WORDS, "loop", "known", *READ_ONLY)
 NO_LOOP = "-"  # in column loop, of a tag whose name says another
@@ -40,11 +49,17 @@ RANGES = """low, high: the range in which a reading can be true; of an mv it hol
 command_low, command_high of an mv: the range that the controller may command; empty is low, high
 max_move_per_min of an mv: the largest change that the controller may make in a minute, in the mv's unit; empty is
   no limit"""
-EXPLAINED = f"""role: pv (to be controlled), mv (what the controller commands), dv (measured disturbance),
-  sp (set point of a loop), mode (of a loop); empty leaves a tag out
+EXPLAINED = f"""role: pv (to be controlled), constraint (a process variable that is only kept in its range), analyser
+  (a pv with a new reading now and then), constraint-analyser (both), mv (what the controller commands), dv (measured
+  disturbance), sp (set point of a loop), mode (of a loop); empty leaves a tag out
 name: of the signal in reports and in the controller
 unit_certain: yes where no reading can be in another unit; empty lets the screening look for such readings
 {RANGES}
+range_low, range_high of a pv, constraint or analyser: the range that the controller keeps it in; empty of a constraint
+  is what the record had
+rank of these: 1 to 4, which range is kept first where two are at odds; empty is 3
+rest of an mv: where it goes while nothing else asks for it
+cost per unit of a pv or mv: what costs or, below 0, earns money; only ratios count
 between: line or step, how a tag that is stored by exception or compressed goes from one reading to the next; empty
   guesses
 ends: keep or drop rows at the lowest or highest value, a limit of the plant or the end of the transmitter; empty
@@ -71,7 +86,7 @@ class Tag:
     """
 
     tag: str
-    role: str  # pv, mv, dv, sp, mode; "" is not used
+    role: str  # pv, mv, dv, sp, mode; "" is not used. A constraint and an analyser are PVs, too
     unit: str = ""
     low: float | None = None
     high: float | None = None
@@ -84,6 +99,26 @@ class Tag:
     ends: Literal["", "keep", "drop"] = ""  # rows at its lowest or highest value; "" as its range says
     loop: str = ""  # tags of one word are one loop; "" goes by the tag's name, NO_LOOP is none
     known: str = ""  # of an input: PV=STATEMENT; PV=STATEMENT, as a person wrote it
+    constraint: bool = False  # a PV without a set point, which is kept in its range
+    analyser: bool = False  # a PV with a new reading now and then
+    range_low: float | None = None  # of a PV: the range that the controller keeps it in
+    range_high: float | None = None
+    rank: float | None = None  # of that range, 1 is kept first
+    rest: float | None = None  # of an MV: where it goes while nothing else asks for it
+    cost: float | None = None  # of a PV or an MV, per unit
+
+    @property
+    def stated_role(self) -> str:
+        """The role as the table of tags has it."""
+        if self.role != "pv":
+            return self.role
+        return next(word for word, of in PV_ROLES.items() if of == (self.constraint, self.analyser))
+
+    @property
+    def operated(self) -> dict[str, float]:
+        """The numbers of OPERATED that were given, by their names."""
+        given = {name: getattr(self, name) for name in OPERATED}
+        return {name: value for name, value in given.items() if value is not None}
 
     @property
     def commands(self) -> dict[str, float]:
@@ -144,6 +179,14 @@ def _says(mode: str, kind: re.Pattern[str]) -> bool:
     return any(map(kind.fullmatch, words)) and not any(map(DENIED.fullmatch, words))
 
 
+def of_role(tag: Tag) -> Tag:
+    """The tag whose role is a word of the table: a constraint or an analyser becomes a PV that is one."""
+    if tag.role not in PV_ROLES:
+        return tag
+    constraint, analyser = PV_ROLES[tag.role]
+    return replace(tag, role="pv", constraint=constraint, analyser=analyser)
+
+
 def safe_name(tag: str) -> str:
     """A name that a manifest, a column `NAME [unit]` and a picture can hold: Latin letters, digits, and _ . - / : #."""
     plain = unicodedata.normalize("NFKD", tag.replace("ß", "ss").replace("µ", "u"))
@@ -176,7 +219,7 @@ def parse_tag(text: str, role: str, known: Callable[[], Collection[str]] = froze
         raise RecordError(
             f"--{role} {text}: write TAG, TAG[unit] or TAG[unit]=LOW..HIGH, as in TIC-101.PV[degC]=0..200"
         )
-    low, high = (_number(match[key], f"--{role} {text}") if match[key] else None for key in ("low", "high"))
+    low, high = (finite_number(match[key], f"--{role} {text}") if match[key] else None for key in ("low", "high"))
     name, unit = match["tag"].strip(), (match["unit"] or "").strip()
     if "=" in text and (whole := text.strip()) in known():  # FI=3..4
         name, unit, low, high = whole, "", None, None
@@ -185,8 +228,8 @@ def parse_tag(text: str, role: str, known: Callable[[], Collection[str]] = froze
         tags = known()
         if whole in tags or (name not in tags and unit.isdecimal()):
             name, unit = (whole, "") if name not in tags or unit.isdecimal() else (name, unit)
-    tag = Tag(name, role, unit, low, high)
-    if wrong := _wrong(tag):
+    tag = of_role(Tag(name, role, unit, low, high))
+    if wrong := mistakes_of_tag(tag):
         raise RecordError(f"--{role} {text}: {'; '.join(wrong)}")
     return tag
 
@@ -200,32 +243,6 @@ def as_it_is(tag: Tag) -> Tag:
     return tag
 
 
-def limited(
-    tags: Sequence[Tag], commands: Iterable[str], moves: Iterable[str], widen: Widen = as_it_is
-) -> tuple[Tag, ...]:
-    """The tags with what options say of MVs: ``TAG=LOW..HIGH`` to command, ``TAG=CHANGE`` the largest in a minute.
-
-    RecordError for another form, for a tag that is no MV, and for numbers that cannot be.
-    """
-    found, options = {t.tag: t for t in tags}, []
-    for option, texts, form in (("command", commands, "LOW..HIGH"), ("max-move", moves, "CHANGE")):
-        options += [(f"--{option} {text}", form, text) for text in texts]
-    for where, form, text in options:
-        name, _, value = text.rpartition("=")
-        ends = value.split("..") if form == "LOW..HIGH" else [value]
-        if not name or len(ends) != 1 + (form == "LOW..HIGH"):
-            raise RecordError(f"{where}: write TAG={form}, as in TIC-101.OP={'15..85' if ends[1:] else '5'}")
-        mvs = [t.tag for t in tags if t.role == "mv"]
-        if name not in mvs:
-            raise RecordError(f"{where}: {name!r} is no mv{nearest(name, mvs)}")
-        keys = COMMANDS[:2] if form == "LOW..HIGH" else COMMANDS[2:]
-        numbers = {key: _number(end, where) for key, end in zip(keys, ends, strict=True)}
-        found[name] = widen(replace(found[name], **numbers))  # type: ignore[arg-type]
-        if wrong := _wrong(found[name]):
-            raise RecordError(f"{where}: {'; '.join(wrong)}")
-    return tuple(found[t.tag] for t in tags)
-
-
 def commanded_range(signal: Signal | InputReport, tags: Sequence[Tag]) -> tuple[float, float]:
     """The range that the controller may command a signal over: as the tag of its name says, else its own."""
     commands = next((t.commands for t in tags if t.name == signal.name), {})
@@ -235,7 +252,7 @@ def commanded_range(signal: Signal | InputReport, tags: Sequence[Tag]) -> tuple[
 def check_tags(tags: Sequence[Tag], where: str) -> None:
     """RecordError unless there are a PV and an MV, and every tag has one role."""
     for role, words in (("pv", "process variable"), ("mv", "manipulated variable")):
-        if not any(t.role == role for t in tags):
+        if not any(t.role == role and not t.constraint for t in tags):
             raise RecordError(f"{where}: no {words} is named; give at least one --{role} TAG, or role {role} in --tags")
     names = [t.tag for t in tags]
     twice = [n for n in names if names.count(n) > 1]
@@ -258,7 +275,7 @@ def write_tags(path: Path, guesses: Iterable[Guess]) -> None:
         rows.writerow(
             [
                 t.tag,
-                t.role,
+                t.stated_role,
                 safe_name(t.tag),
                 t.unit,
                 "yes" if t.unit_certain else "",
@@ -307,7 +324,7 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
         numbers: dict[str, float] = {}
         for key in NUMBERS:
             try:
-                numbers |= {key: _number(cells[key], f"{where}, {key}")} if cells.get(key) else {}
+                numbers |= {key: finite_number(cells[key], f"{where}, {key}")} if cells.get(key) else {}
             except RecordError as error:
                 wrong.append(str(error))
         certain = cells.get("unit_certain", "").lower()
@@ -320,25 +337,29 @@ def read_tags(path: Path, widen: Widen = as_it_is) -> tuple[Tag, ...]:
             if word not in ("", *WORDS[key])
         ]
         unit, name = cells.get("unit", ""), cells.get("name", "")
-        given = Tag(cells["tag"], role, unit, name=name, **numbers)  # type: ignore[arg-type]
+        given = of_role(Tag(cells["tag"], role, unit, name=name, **numbers))  # type: ignore[arg-type]
         given = replace(given, loop=cells.get("loop", ""), known=cells.get("known", ""))
         tag = widen(replace(given, unit_certain=CERTAIN.get(certain, False), **taken))  # type: ignore[arg-type]
-        wrong += [f"{where}: {words}" for words in _wrong(tag)]
+        wrong += [f"{where}: {words}" for words in mistakes_of_tag(tag)]
         found.append(tag)
     if wrong:
         raise TableError(wrong)
     return tuple(found)
 
 
-def _wrong(tag: Tag) -> list[str]:
+def mistakes_of_tag(tag: Tag) -> list[str]:
     """Faults in the numbers of a tag, a clause each."""
     if tag.role != "mv" and tag.commands:
         verb, it = ("belong", "them") if len(tag.commands) > 1 else ("belongs", "it")
         return [f"{', '.join(tag.commands)} {verb} to an mv, which the controller commands; leave {it} empty"]
-    return mistakes_of_mv(tag)
+    low, high = (-inf if tag.low is None else tag.low), (inf if tag.high is None else tag.high)
+    if tag.role == "mv":
+        low, high = tag.commands.get("command_low", low), tag.commands.get("command_high", high)
+    return [*mistakes_of_mv(tag), *mistakes_of_operated(tag.role, tag.stated_role, tag.operated, (low, high))]
 
 
-def _number(text: str, where: str) -> float:
+def finite_number(text: str, where: str) -> float:
+    """The number of a cell or an option; RecordError, beginning with ``where``, for another text."""
     try:
         value = float(text.strip().replace(",", "."))
     except ValueError:

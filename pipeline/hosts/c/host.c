@@ -271,9 +271,9 @@ typedef struct {
   size_t above; /* of a low end: the place of the high one, which it must not exceed; its own place of any other */
 } Operate;
 
-enum { SP, PV, DV, MV, STATE, OPERATE, FRESH, INPUTS }; /* the first four have signals */
+enum { SP, PV, DV, MV, STATE, OPERATE, FRESH, AHEAD, INPUTS }; /* the first four have signals */
 enum { OUT_MV, OUT_STATE, OUT_INFO, OUTPUTS };
-static const char *const INPUT[INPUTS] = {"sp", "pv", "dv", "mv_applied", "state", "operate", "fresh"};
+static const char *const INPUT[INPUTS] = {"sp", "pv", "dv", "mv_applied", "state", "operate", "fresh", "ahead"};
 static const char *const OUTPUT[OUTPUTS] = {"mv", "state_next", "info"};
 
 typedef enum { STEPPED, REFUSED_INPUT, REFUSED_OUTPUT } Outcome;
@@ -288,6 +288,7 @@ typedef struct {
   Operate *operate_entries; /* what operators may change, n_in[OPERATE] of them */
   double *operate; /* of all steps; the defaults until controller_operate */
   double *fresh; /* 1 for a new and good reading of each PV, else 0: all 1 unless you write them before a step */
+  double *ahead; /* differences to come of set points and measured disturbances: 0 unless you write them before a step */
   double *state;       /* what the law remembers: the last step's state_next; zeros: no past */
   double *in[INPUTS];  /* the session reads here */
   double *out[OUTPUTS]; /* and writes here: mv, state_next and info of the last step */
@@ -438,10 +439,50 @@ static bool controller_operate(Controller *c, const double *values) {
   return true;
 }
 
+/* By how much set points and measured disturbances will differ from now: at each of the horizon's samples one number of
+   each signal, set points first. */
+static bool read_ahead(Controller *c) {
+  const Json *ahead = json_get(&c->manifest, "ahead"), *signals = json_get(ahead, "signals");
+  size_t n = c->n_in[SP] + c->n_in[DV];
+  double horizon = json_number(json_get(ahead, "horizon"));
+  if (!ahead) return true;
+  if (!(horizon >= 1 && horizon <= 10000 && horizon == floor(horizon))) return failed(c, "the manifest's ahead has no horizon");
+  if (json_number(json_get(ahead, "period_s")) != json_number(json_get(&c->manifest, "period_s")))
+    return failed(c, "the manifest's ahead has another period than its law");
+  if (!signals || signals->kind != J_LIST || signals->n != n)
+    return failed(c, "the manifest's ahead does not list the set points and measured disturbances");
+  for (size_t k = 0; k < n; k++) {
+    const Signal *s = k < c->n_in[SP] ? &c->signals[SP].at[k] : &c->signals[DV].at[k - c->n_in[SP]];
+    if (strcmp(json_word(&signals->items[k], "signal"), s->name))
+      return failed(c, "the manifest's ahead has another order than its set points and measured disturbances");
+  }
+  c->n_in[AHEAD] = (size_t)horizon * n;
+  return true;
+}
+
+/* Whether c->ahead may be given beside these set points and disturbances: finite, and no value to come out of its range.
+   A present value outside it may stay; one that is not finite is refused for itself. */
+static bool ahead_allowed(Controller *c, const double *const given[STATE]) {
+  size_t n_sp = c->n_in[SP], n = n_sp + c->n_in[DV];
+  for (size_t k = 0; c->uses[AHEAD] && k < c->n_in[AHEAD]; k++) {
+    const Json *listed = json_get(json_get(&c->manifest, "ahead"), "signals");
+    bool is_sp = k % n < n_sp;
+    const double *values = given[is_sp ? SP : DV];
+    double now = values ? values[k % n - (is_sp ? 0 : n_sp)] : NAN, then = now + c->ahead[k];
+    double low = json_number(json_get(&listed->items[k % n], "low")), high = json_number(json_get(&listed->items[k % n], "high"));
+    double slack = 1e-9 * (high - low);
+    if (isfinite(c->ahead[k]) && (!isfinite(now) || (then >= fmin(low, now) - slack && then <= fmax(high, now) + slack)))
+      continue;
+    return failed(c, "ahead: %.200s is %.6g at sample %zu; allowed is %.6g to %.6g", json_word(&listed->items[k % n], "signal"),
+                  then, k / n + 1, low, high);
+  }
+  return true;
+}
+
 /* The manifest inside the file. Entries that a host acts on must stand in the JSON beside it too: whoever changed
    that one would else be shown other ranges than those that hold. */
 static bool find_manifest(Controller *c, const Json *beside) {
-  static const char *const ACTED_ON[] = {"schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv", "operate"};
+  static const char *const ACTED_ON[] = {"schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv", "operate", "ahead"};
   OrtModelMetadata *metadata = NULL;
   OrtAllocator *allocator = NULL;
   char *text = NULL;
@@ -468,7 +509,7 @@ static bool read_manifest(Controller *c) {
     if (!read_signals(c, KEY[i], &c->signals[i])) return false;
     c->n_in[i] = c->signals[i].n;
   }
-  if (!read_operate(c)) return false;
+  if (!read_operate(c) || !read_ahead(c)) return false;
   c->n_in[FRESH] = c->n_in[PV];
   double n_state = json_number(json_get(m, "n_state"));
   c->period_s = json_number(json_get(m, "period_s"));
@@ -487,6 +528,8 @@ static bool read_manifest(Controller *c) {
   }
   if (c->uses[OPERATE] && !c->n_in[OPERATE])
     return failed(c, "the manifest's law reads operate, but the manifest has no entries of it");
+  if (c->uses[AHEAD] && !c->n_in[AHEAD])
+    return failed(c, "the manifest's law reads ahead, but the manifest does not say what it is");
   for (size_t i = 0; i < c->n_in[MV]; i++)
     if (!c->uses[MV] && c->signals[MV].at[i].max_move < INFINITY)
       return failed(c, "the moves of %s are limited, but its law does not read mv_applied", c->signals[MV].at[i].name);
@@ -561,6 +604,7 @@ static void controller_close(Controller *c) {
   free(c->operate_entries);
   free(c->operate);
   free(c->fresh);
+  free(c->ahead);
   free(c->state);
   json_free(&c->manifest);
 }
@@ -594,7 +638,8 @@ static bool controller_open(Controller *c, const char *path) {
   c->state = calloc(c->n_in[STATE] + 1, sizeof *c->state);
   c->operate = calloc(c->n_in[OPERATE] + 1, sizeof *c->operate);
   c->fresh = calloc(c->n_in[FRESH] + 1, sizeof *c->fresh);
-  if (!c->state || !c->operate || !c->fresh) return failed(c, "no memory");
+  c->ahead = calloc(c->n_in[AHEAD] + 1, sizeof *c->ahead);
+  if (!c->state || !c->operate || !c->fresh || !c->ahead) return failed(c, "no memory");
   for (size_t k = 0; k < c->n_in[OPERATE]; k++) c->in[OPERATE][k] = c->operate_entries[k].standard;
   if (!controller_operate(c, c->in[OPERATE])) return false;
   for (size_t k = 0; k < c->n_in[FRESH]; k++) c->fresh[k] = c->in[FRESH][k] = 1;
@@ -603,16 +648,18 @@ static bool controller_open(Controller *c, const char *path) {
   return run_graph(c); /* a first step, discarded: a wrong shape shows now, and code and weights are warm */
 }
 
-/* One step on given[SP], [PV], [DV], [MV] (the MV that the plant received), c->operate and c->fresh. The state stays as
-   it was if refused. A PV that is not fresh must be finite all the same. */
+/* One step on given[SP], [PV], [DV], [MV] (the MV that the plant received), c->operate, c->fresh and c->ahead. The state
+   stays as it was if refused. A PV that is not fresh must be finite all the same. */
 static Outcome controller_step(Controller *c, const double *const given[STATE]) {
   for (size_t k = 0; c->uses[FRESH] && k < c->n_in[FRESH]; k++) {
     if (c->fresh[k] == 0 || c->fresh[k] == 1) continue;
     failed(c, "fresh of %s is %g; it is 1 for a new and good reading, or 0", c->signals[PV].at[k].name, c->fresh[k]);
     return REFUSED_INPUT;
   }
+  if (!ahead_allowed(c, given)) return REFUSED_INPUT;
+  const double *const own[INPUTS] = {[STATE] = c->state, [OPERATE] = c->operate, [FRESH] = c->fresh, [AHEAD] = c->ahead};
   for (int i = 0; i < INPUTS; i++) {
-    const double *values = i == STATE ? c->state : i == OPERATE ? c->operate : i == FRESH ? c->fresh : given[i];
+    const double *values = i < STATE ? given[i] : own[i];
     if (c->uses[i] && c->n_in[i] && !values) {
       failed(c, "%s is missing; no MV is computed without it", INPUT[i]);
       return REFUSED_INPUT;
@@ -1093,6 +1140,8 @@ static bool kit_step(Controller *c, Run run, const Json *row, const Json *scale,
   }
   if (c->uses[FRESH] && !numbers(json_get(json_get(row, "given"), "fresh"), c->n_in[FRESH], c->fresh))
     return failed(c, "a step of the kit lacks fresh");
+  if (c->uses[AHEAD] && !numbers(json_get(json_get(row, "given"), "ahead"), c->n_in[AHEAD], c->ahead))
+    return failed(c, "a step of the kit lacks ahead");
   static const char *const BECAUSE[] = {"", "input", "output"};
   double began = seconds();
   Outcome outcome = controller_step(c, given);
@@ -1169,6 +1218,7 @@ static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t
   controller_cold(c);
   for (size_t k = 0; k < c->n_in[OPERATE]; k++) c->operate[k] = c->operate_entries[k].standard; /* of all scans */
   for (size_t k = 0; k < c->n_in[FRESH]; k++) c->fresh[k] = 1;
+  memset(c->ahead, 0, c->n_in[AHEAD] * sizeof *c->ahead);
   if (done) {
     l->recover_after = (int)json_number(json_get(begin, "recover_after"));
     l->max_gap = json_number(json_get(begin, "max_gap"));

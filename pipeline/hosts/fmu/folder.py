@@ -46,6 +46,9 @@ OPERATED = """<p><code>operate.NAME</code> is what operators may change: a tunab
 any communication step. A value outside its range is refused where it is set, a low end above its high one at the end
 of the initialization and at the next step. <code>fresh.NAME</code> is 1 for a process variable whose reading is new
 and good, 0 for one that is neither; these inputs are read where the parameter <code>use_fresh</code> is true.</p>"""
+KNOWN = """<p><code>ahead.sp.NAME.I</code> and <code>ahead.dv.NAME.I</code> say by how much a set point or a measured
+disturbance will differ from its present value in I periods. Inputs that nothing is connected to stay 0: it stays as it
+is. A value to come outside its range is refused, as a sample that is not finite.</p>"""
 
 
 def token_of(controller: Controller) -> str:
@@ -104,7 +107,9 @@ def page(controller: Controller) -> bytes:
         for r in rows
     )
     title = html.escape(words_of(controller))
-    further = [words for name, words in (("mv_applied", APPLIED), ("operate", OPERATED)) if name in m.inputs]
+    further = [
+        words for name, words in (("mv_applied", APPLIED), ("operate", OPERATED), ("ahead", KNOWN)) if name in m.inputs
+    ]
     return (
         f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title>\n<h1>{title}</h1>\n'
         f"{SAMPLING.format(period=m.period_s)}\n{chr(10).join(further)}\n"
@@ -151,7 +156,9 @@ def _start_of(output: ScalarVariable, rows: list[ScalarVariable]) -> list[Scalar
 
 def _common(row: ScalarVariable) -> dict[str, str]:
     varies = {"output": "discrete", "parameter": "fixed"}.get(row.causality, "continuous")
-    varies = {"operate": "tunable", "fresh": "discrete"}.get(row.group, varies)  # a tool interpolates no flag
+    varies = {"operate": "tunable", "fresh": "discrete", "ahead": "discrete"}.get(
+        row.group, varies
+    )  # a tool interpolates no flag
     found = {"name": row.name, "valueReference": str(row.reference), "causality": row.causality, "variability": varies}
     return found | {"description": row.words} | ({"initial": "calculated"} if row.causality == "output" else {})
 
@@ -241,7 +248,8 @@ NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]
 class ScalarVariable:
     """A scalar variable.
 
-    ``group``: sp, pv, dv, mv_applied, mv_start, mv, info, operate, fresh; time, fault, use_mv_applied or use_fresh.
+    ``group``: sp, pv, dv, mv_applied, mv_start, mv, info, operate, fresh, ahead; time, fault, use_mv_applied or
+    use_fresh.
     ``low``, ``high`` and ``start`` are None where there is none.
     """
 
@@ -303,6 +311,7 @@ OPERATED_WORDS: Mapping[What, str] = {
     "track": "1: the set point is wanted, 0: the range alone",
     "low": "low end of the range in which it may be",
     "high": "high end of the range in which it may be",
+    "weight": "times that of its set point; the smaller one gives way",
     "rank": "1: its range is kept before those of 2",
     "max_move": "largest move a period",
     "rest": "where it goes that nothing asks for",
@@ -314,7 +323,10 @@ OPERATED_WORDS: Mapping[What, str] = {
 
 
 def _steering(m: Manifest) -> Iterator[ScalarVariable]:
-    """``operate`` and ``fresh`` of a law that reads them. They stand last: no other variable has another reference."""
+    """``operate``, ``fresh`` and ``ahead`` of a law that reads them.
+
+    They stand last: no other variable has another reference.
+    """
     for e in m.operate if "operate" in m.inputs else ():
         name, unit = in_xml(f"operate.{e.name}"), "" if e.unit == "-" else in_xml(e.unit)
         words = OPERATED_WORDS[e.what]
@@ -325,6 +337,14 @@ def _steering(m: Manifest) -> Iterator[ScalarVariable]:
             yield ScalarVariable(in_xml(f"fresh.{s.name}"), 0, "fresh", "input", words, "", 0.0, 1.0, 1.0)
         words = "whether fresh is read; otherwise all readings are"
         yield ScalarVariable("use_fresh", 0, "use_fresh", "parameter", words, start=False)
+    if m.ahead is None or "ahead" not in m.inputs:
+        return
+    for i in range(1, m.ahead.horizon + 1):
+        for a in m.ahead.signals:
+            kind, span = "set point" if a.group == "sp" else "disturbance", a.high - a.low
+            words = f"this {kind} after {i} periods, minus what it is now"
+            name, unit = in_xml(f"ahead.{a.group}.{a.signal}.{i}"), "" if a.unit == "-" else in_xml(a.unit)
+            yield ScalarVariable(name, 0, "ahead", "input", words, unit, -span, span, 0.0)
 
 
 def _variable(s: Signal, reference: int, group: str, causality: str, words: str) -> ScalarVariable:

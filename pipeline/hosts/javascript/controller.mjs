@@ -10,7 +10,7 @@ export class Refused extends Error {
   }
 }
 
-const INPUTS = ["sp", "pv", "dv", "mv_applied", "state", "operate", "fresh"];
+const INPUTS = ["sp", "pv", "dv", "mv_applied", "state", "operate", "fresh", "ahead"];
 const OUTPUTS = ["mv", "state_next", "info"];
 const hex = (bytes) => [...new Uint8Array(bytes)].map((b) => b.toString(16).padStart(2, "0")).join("");
 const same = (a, b) => [...a].sort().join() === [...b].sort().join();
@@ -18,7 +18,7 @@ const same = (a, b) => [...a].sort().join() === [...b].sort().join();
 const MOVE_ROUNDING = 1e-9; // share of an MV's largest magnitude by which a sum of it and its max_move may be rounded
 
 // Entries that a host acts on. They must stand in the .json too: whoever changed that one would else be shown other ranges.
-const ACTED_ON = ["schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv", "operate"];
+const ACTED_ON = ["schema", "period_s", "inputs", "n_state", "info", "sp", "pv", "dv", "mv", "operate", "ahead"];
 
 const SWITCHES = ["use", "track", "rest_use"];
 
@@ -95,7 +95,7 @@ export class Controller {
     if (limited && !manifest.inputs.includes("mv_applied"))
       throw new Refused(`the moves of ${limited.name} are limited, but its law does not read mv_applied`);
     for (const name of INPUTS.filter((n) => manifest.inputs.includes(n))) {
-      const n = { state: manifest.n_state, operate: this.operate.entries.length, fresh: manifest.pv.length }[name] ?? this.signals[name].length;
+      const n = { state: manifest.n_state, operate: this.operate.entries.length, fresh: manifest.pv.length, ahead: this.#coming().length }[name] ?? this.signals[name].length;
       this.buffers[name] = new Float64Array(n);
       this.feeds[name] = new ort.Tensor("float64", this.buffers[name], [n]);
     }
@@ -109,10 +109,11 @@ export class Controller {
   // One step: {sp, pv, dv, mv_applied, state} -> {mv, state_next, info}; Refused where no MV may be computed or used.
   // Keep state_next for the next step, and the old state after a refusal. One step at a time.
   // `operate` may be given, in the order of its entries (else: the defaults), and `fresh`, 1 for each PV whose reading is
-  // new and good, else 0 (else: all are). A PV that is not fresh must be finite all the same.
+  // new and good, else 0 (else: all are). A PV that is not fresh must be finite all the same. `ahead` are the differences to
+  // come of set points and measured disturbances, as the manifest's `ahead` lists them (else: zeros).
   async step(given) {
     for (const [name, buffer] of Object.entries(this.buffers)) {
-      const values = this.#steered(name, given[name]);
+      const values = name === "ahead" ? this.#known(given) : this.#steered(name, given[name]);
       if (values?.length !== buffer.length) throw new Error(`${name} has ${values?.length} values; it needs ${buffer.length}`);
       const bad = values.findIndex((value) => !Number.isFinite(value));
       if (bad >= 0) {
@@ -126,6 +127,29 @@ export class Controller {
     const [mv, state_next, info] = OUTPUTS.map((name) => Float64Array.from(result[name]?.data ?? []));
     this.#refuse({ mv, state_next, info });
     return { mv, state_next, info };
+  }
+
+  // Zeros, one for each number of `ahead`.
+  #coming() {
+    const { horizon = 0, signals = [] } = this.manifest.ahead ?? {};
+    return new Array(horizon * signals.length).fill(0);
+  }
+
+  // `ahead` of a step; Refused where a value to come is out of its range, or a difference is not finite. A present value
+  // outside it may stay, and one that is not finite is refused for itself.
+  #known({ ahead, sp, dv }) {
+    const none = this.#coming();
+    if (!ahead) return none;
+    if (ahead.length !== none.length) throw new Refused(`ahead has ${ahead.length} values; it needs ${none.length}`, "input");
+    const { signals } = this.manifest.ahead, present = [...sp, ...(dv ?? [])];
+    Array.from(ahead).forEach((change, k) => {
+      const { signal, low, high } = signals[k % signals.length], now = present[k % signals.length];
+      const slack = 1e-9 * (high - low), then = now + change;
+      if (Number.isFinite(change) && (!Number.isFinite(now) || (then >= Math.min(low, now) - slack && then <= Math.max(high, now) + slack))) return;
+      const at = Math.floor(k / signals.length) + 1;
+      throw new Refused(`ahead: ${signal} is ${Number.isFinite(then) ? short(then) : word(then)} at sample ${at}; allowed is ${short(low)} to ${short(high)}`, "input");
+    });
+    return ahead;
   }
 
   // Defaults where there is none, and what is wrong with a given one.
@@ -267,6 +291,7 @@ export class Loop {
     this.sp = within(sp, controller.manifest.sp, "set point");
     this.mv = this.before = mv && within(mv, controller.manifest.mv, "MV");
     this.operate = controller.operate.default; // see setOperate
+    this.ahead = null; // set it before a scan: what is to come, as of Controller.step; null: nothing
     this.wishes = {}; // the values that somebody has set, by name; they outlast a law that lacks them
     this.wanted = null; // where an operator sent the MV: it goes there by at most its max_move a period
   }
@@ -300,7 +325,7 @@ export class Loop {
     const known = controller.operate.entries.map((e) => e.name);
     const set = Object.entries(this.wishes).filter(([name]) => known.includes(name));
     const operate = controller.operate.withValues(Object.fromEntries(set));
-    Object.assign(this, { controller, state: controller.cold(), operate });
+    Object.assign(this, { controller, state: controller.cold(), operate, ahead: null });
     this.bridging = new Bridging(controller.manifest, this.bridging.bridgeS, this.bridging.critical);
   }
 
@@ -335,7 +360,7 @@ export class Loop {
     let step;
     try {
       const { pv, fresh, operate } = readings ?? { pv: given.pv, operate: this.operate };
-      step = await this.controller.step({ sp: this.sp, pv, dv: given.dv, mv_applied: applied, state: this.state, operate, fresh });
+      step = await this.controller.step({ sp: this.sp, pv, dv: given.dv, mv_applied: applied, state: this.state, operate, fresh, ahead: this.ahead });
     } catch (error) {
       if (this.mode === "AUTO") this.mv = applied;
       return this.#miss(wordsOf(error));

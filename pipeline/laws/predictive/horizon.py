@@ -138,14 +138,18 @@ class Prediction(NamedTuple):
 class LinearHorizon(nn.Module):
     """Free run x(1) .. x(N) of a linear model from [x, d, dv] under a plan z, loads and measured disturbances held.
 
-    It is affine in [x, d, dv, z], one product, and its slopes are constant.
+    It is affine in [x, d, dv, z], one product, and its slopes are constant. With ``forecasts`` measured disturbances
+    may differ from dv later: the run is affine in that, too.
     """
 
     slopes: Tensor  # (m, N n_cv)
     slopes_t: Tensor  # (N n_cv, m)
+    later: Tensor | None  # (N n_dv, N n_cv) from dv(i) - dv, i = 1 .. N, to the run
 
     @torch.no_grad()
-    def __init__(self, model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int) -> None:
+    def __init__(
+        self, model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int, *, forecasts: bool = False
+    ) -> None:
         super().__init__()
 
         def run(p: Named) -> dict[str, Tensor]:
@@ -156,13 +160,21 @@ class LinearHorizon(nn.Module):
             return {"y": torch.cat(y, dim=-1)}
 
         self.run = AffineMap(layout_of(model, loads, moves), run)
+        self.register_buffer("later", later_of(model, loads, moves, run) if forecasts else None)
         slopes = self.run.matrix[-moves.count :].clone()
         self.register_buffer("slopes", slopes)
         self.register_buffer("slopes_t", slopes.T.contiguous())
 
-    def forward(self, start: Tensor, plan: Tensor) -> Prediction:
-        """The run from ``start`` (..., 1, n_x + n_d + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
-        return Prediction(self.run(torch.cat([start, plan], dim=-1))["y"], self.slopes, self.slopes_t)
+    def forward(self, start: Tensor, plan: Tensor, offset: Tensor | None = None) -> Prediction:
+        """The run from ``start`` (..., 1, n_x + n_d + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled.
+
+        ``offset`` is of ``forecast``; None: measured disturbances stay as they are.
+        """
+        return Prediction(self.run(torch.cat([start, plan], dim=-1), offset)["y"], self.slopes, self.slopes_t)
+
+    def forecast(self, later: Tensor) -> Tensor:
+        """The run's offset where measured disturbances change: ``later`` (..., 1, N n_dv) dv(i) - dv, scaled."""
+        return forecast_offset(self.run, self.later, later)
 
 
 class NetworkHorizon(nn.Module):
@@ -179,9 +191,11 @@ class NetworkHorizon(nn.Module):
 
         S(i+1) = S(i) F(i) + [0, Z(i+1)],   F(i) = [[A'], [B']] + W1' diag(1 - t^2) W2', zero in the columns of v
 
-    for t = tanh(h(i)) and Z(i) the share of each entry of the plan in v(i). F is affine in t^2.
+    for t = tanh(h(i)) and Z(i) the share of each entry of the plan in v(i). F is affine in t^2. With ``forecasts``
+    measured disturbances may differ from dv later: P is affine in that, too.
     """
 
+    later: Tensor | None  # (N n_dv, (N + 1) n_p) from dv(i) - dv, i = 1 .. N, to P
     step: Tensor  # (n_p, n_p) M
     bends: Tensor  # (n_h, n_s n_s) -W1' W2' of each unit
     straight: Tensor  # (n_s n_s,) F where no unit bends
@@ -191,14 +205,18 @@ class NetworkHorizon(nn.Module):
     by_small: Tensor  # (1,)
 
     @torch.no_grad()
-    def __init__(self, model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int) -> None:
+    def __init__(
+        self, model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int, *, forecasts: bool = False
+    ) -> None:
         super().__init__()
         n, m, n_x, n_mv = moves.horizon, moves.count, model.n_x, model.n_mv
         self.n, self.m, self.n_h, self.n_cv, self.n_s = n, m, model.n_hidden, n_cv, n_x + n_mv
-        self.run = AffineMap(
-            layout_of(model, loads, moves),
-            lambda p: {f"p{i}": u for i, u in enumerate(_forced(model, loads, moves, mv_of, p))},
-        )
+
+        def forced(p: Named) -> Named:
+            return {f"p{i}": u for i, u in enumerate(_forced(model, loads, moves, mv_of, p))}
+
+        self.run = AffineMap(layout_of(model, loads, moves), forced)
+        self.register_buffer("later", later_of(model, loads, moves, forced) if forecasts else None)
         # from tanh(p) to the unforced x
         w1_x, to_x = model.w1[:, :n_x], torch.cat([model.w2, model.a / SMALL_TANH], dim=1)
         gain = mv_of(torch.eye(n_mv, dtype=torch.float64)) - mv_of(torch.zeros(n_mv, dtype=torch.float64))
@@ -220,11 +238,18 @@ class NetworkHorizon(nn.Module):
             self.register_buffer(name, matrix.contiguous())
         hold_numbers(self, by_small=1 / SMALL_TANH)
 
-    def forward(self, start: Tensor, plan: Tensor) -> Prediction:
-        """The run from ``start`` (..., 1, n_x + n_d + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled."""
+    def forecast(self, later: Tensor) -> Tensor:
+        """The run's offset where measured disturbances change: ``later`` (..., 1, N n_dv) dv(i) - dv, scaled."""
+        return forecast_offset(self.run, self.later, later)
+
+    def forward(self, start: Tensor, plan: Tensor, offset: Tensor | None = None) -> Prediction:
+        """The run from ``start`` (..., 1, n_x + n_d + n_dv) [x, d, dv] under ``plan`` (..., 1, m), all scaled.
+
+        ``offset`` is of ``forecast``; None: measured disturbances stay as they are.
+        """
         given = torch.cat([start, plan], dim=-1)
         batch, n_h = given.shape[:-2], self.n_h
-        forced = list(self.run(given).values())
+        forced = list(self.run(given, offset).values())
         t = torch.tanh(forced[0])
         steps = [t]
         for force in forced[1:]:
@@ -250,10 +275,11 @@ class NetworkHorizon(nn.Module):
 
 
 def horizon_of(
-    model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int
+    model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, n_cv: int, *, forecasts: bool = False
 ) -> LinearHorizon | NetworkHorizon:
-    """The free run of a model over the first ``n_cv`` of its outputs."""
-    return (NetworkHorizon if model.n_hidden else LinearHorizon)(model, loads, moves, mv_of, n_cv)
+    """The free run of a model over the first ``n_cv`` of its outputs; ``forecasts`` of measured disturbances or not."""
+    kind = NetworkHorizon if model.n_hidden else LinearHorizon
+    return kind(model, loads, moves, mv_of, n_cv, forecasts=forecasts)
 
 
 def layout_of(model: Identified, loads: Loads, moves: Moves) -> dict[str, int]:
@@ -262,9 +288,33 @@ def layout_of(model: Identified, loads: Loads, moves: Moves) -> dict[str, int]:
 
 
 def inputs(moves: Moves, mv_of: Scaling, p: Named) -> Tensor:
-    """Scaled v over the horizon, (..., N, n_v), of a plan p["z"] and measured disturbances p["dv"]."""
+    """Scaled v over the horizon, (..., N, n_v), of a plan p["z"] and measured disturbances p["dv"].
+
+    p["later"] (..., N n_dv), where there is one, says by how much these differ from it at the samples 1 .. N; the last
+    one acts on no output of the horizon.
+    """
     mv = mv_of(moves.courses(p["z"]))
-    return torch.cat([mv, p["dv"].unsqueeze(-2).expand(*mv.shape[:-1], p["dv"].shape[-1])], dim=-1)
+    dv = p["dv"].unsqueeze(-2).expand(*mv.shape[:-1], p["dv"].shape[-1])
+    if "later" in p:
+        dv = dv + pad(p["later"].reshape(dv.shape)[..., :-1, :], (0, 0, 1, 0))
+    return torch.cat([mv, dv], dim=-1)
+
+
+def later_of(model: Identified, loads: Loads, moves: Moves, run: Callable[[Named], Named]) -> Tensor:
+    """Answers of the results of ``run`` to a unit of each p["later"], (N n_dv, their size)."""
+    rest = {name: torch.zeros(n, dtype=torch.float64) for name, n in layout_of(model, loads, moves).items()}
+
+    def formulas(p: Named) -> Named:
+        count = p["later"].shape[:-1]
+        return run({**{name: zero.expand(*count, -1) for name, zero in rest.items()}, **p})
+
+    return AffineMap({"later": moves.horizon * model.n_dv}, formulas).matrix
+
+
+def forecast_offset(run: AffineMap, matrix: Tensor | None, later: Tensor) -> Tensor:
+    """The offset of ``run`` where measured disturbances differ from what they are by ``later`` (..., 1, N n_dv)."""
+    assert matrix is not None  # the law was built with forecasts
+    return product(later, matrix, run.offset)
 
 
 def _forced(model: Identified, loads: Loads, moves: Moves, mv_of: Scaling, p: Named) -> list[Tensor]:

@@ -39,7 +39,9 @@ class PredictiveParams:
     and loads, drawn by ``seed``. ``mv_rate`` [mv]: largest MV change a sample, which the plan knows, one number or one
     for each MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
     none; None: no limits. A set point beyond a limit counts as one at the limit. ``preview`` of the set points:
-    ``held``, as they are now; ``ramp``, their last slope goes on, as in a recipe of ramps; steps to come are not known.
+    ``held``, as they are now; ``ramp``, their last slope goes on, as in a recipe of ramps; ``course``, as the input
+    ``ahead`` gives them at each sample, steps to come and forecasts of measured disturbances included, and as now
+    where nothing is given.
     ``operate``: other defaults, by name, of the numbers that operators change while the law runs, as ``TIC-1.low`` or
     ``valve.rest``, and may be empty: the law then reads these numbers and which readings are fresh, and soft limits
     are the defaults of its ranges; None: it has none of this.
@@ -64,15 +66,15 @@ class PredictiveParams:
     mv_rate: Rates = None
     cv_low: Limits = None
     cv_high: Limits = None
-    preview: Literal["held", "ramp"] = "held"
-    operate: Mapping[str, float] | None = None
+    preview: Literal["held", "ramp", "course"] = "held"
+    operate: Mapping[str, float | bool] | None = None
 
     def __post_init__(self) -> None:
         for name in ("speed", "caution", "jumps", "move_weight", "eps", "q_x", "q_d"):
             given = getattr(self, name)
             if given is not None and not 0 < given < np.inf:
                 raise ValueError(f"{name} is {given}; it must be above 0, and finite")
-        words = {"loads": ("mvs", "outputs"), "tuning": ("given", "search"), "preview": ("held", "ramp")}
+        words = {"loads": ("mvs", "outputs"), "tuning": ("given", "search"), "preview": ("held", "ramp", "course")}
         for name, allowed in words.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} is {getattr(self, name)!r}; allowed are {', '.join(allowed)}")

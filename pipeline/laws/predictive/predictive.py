@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from loopwright.pipeline.laws.predictive.cold_rest import BentRest, bent_rest, h
 from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, loads_of
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of, product
 from loopwright.pipeline.laws.predictive.horizon_check import AnswerTimes, horizon_for, mvs_of, refuse_unstable
+from loopwright.pipeline.laws.predictive.known_future import KnownFuture, ahead_of
 from loopwright.pipeline.laws.predictive.observer import Noises, Observer, StateEstimate, load_variance
 from loopwright.pipeline.laws.predictive.operating import OperateScales, Operation, entries_of
 from loopwright.pipeline.laws.predictive.params import (
@@ -23,7 +24,7 @@ from loopwright.pipeline.laws.predictive.params import (
     refuse_discrete,
     weights_of,
 )
-from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Cost, Planner, SetPointCourse, SoftLimits
+from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Cost, OperatedPlan, Planner, SetPointCourse, SoftLimits
 from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, in_words, tuned
 from loopwright.pipeline.laws.predictive.tuning_loops import TuningLoops
 from loopwright.pipeline.models.base import Model
@@ -40,6 +41,30 @@ CALM_JUMPS = 0.1  # the observer takes a swing of its own loop for steps of a lo
 UNBOUNDED = 1e6  # scaled: no set point comes near
 
 
+class PlanProblem(NamedTuple):
+    """A step's problem, scaled, as the planner takes it, and all that its answer needs beside the plan."""
+
+    start: Tensor  # (..., 1, n_x + n_d + n_dv) [x, d, dv]
+    wanted: Tensor  # (..., 1, N n_o) set points
+    applied: Tensor  # (..., 1, n_mv) where the MVs go on from
+    plan: Tensor  # (..., 1, m) to begin at
+    operated: OperatedPlan | None
+    forecast: Tensor | None  # of the horizon where measured disturbances change
+    mean: Tensor  # (..., 1, n_x + n_d) [x, d]
+    now: Named  # the inputs
+    kept: Named  # the state
+    fresh: Tensor | None  # (..., 1, n_y)
+    boost: Tensor  # (..., 1, n_y)
+    next_kept: Named  # what goes to the next state, in its order, the plan and the MVs apart
+    stands: Tensor  # (..., n_mv) [mv] as ``applied``
+    mv_applied: Tensor  # (..., n_mv) [mv]
+
+    @property
+    def given(self) -> tuple[Tensor, Tensor, Tensor, Tensor, OperatedPlan | None, Tensor | None]:
+        """The planner's arguments."""
+        return self.start, self.wanted, self.applied, self.plan, self.operated, self.forecast
+
+
 class Predictive(ControlLaw):
     """Model predictive control of several variables by several, free of offset.
 
@@ -53,8 +78,9 @@ class Predictive(ControlLaw):
     of reach ends at the nearest output. The last plan, one sample on, is where the next one begins. The filter reads
     the MV that really acted: that is the anti-windup. Without a past it starts at the rest that fits the process
     variables and the applied MV, under the loads that hold it there: on set point it asks for that MV. The set points r
-    stay as they are, or go on with their last slope. CVs may have soft limits, whose cost is added. With ``operate``
-    operators give ranges, take signals out, and set priorities, resting values and costs while it runs.
+    stay as they are, go on with their last slope, or change as ``ahead`` says, and so may the measured disturbances.
+    CVs may have soft limits, whose cost is added. With ``operate`` operators give ranges, take signals out, and set
+    priorities, resting values and costs while it runs.
 
     ``Observer``, ``LinearHorizon`` and ``NetworkHorizon``, ``Planner``, ``SetPointCourse`` and ``SoftLimits`` hold the
     formulas and their sources.
@@ -71,6 +97,7 @@ class Predictive(ControlLaw):
     calmer: tuple[Identified, PredictiveParams] | None = None  # of a search: model and numbers of last resort
     remarks: tuple[str, ...] = ()  # on a horizon that is short for the model
     operation: Operation | None  # of a law that reads ``operate`` and ``fresh``
+    known: KnownFuture | None  # of a law that reads ``ahead``
     operate_default: Tensor  # (n_operate,)
     same: Tensor  # (n_mv,) [mv] by which a read-back may be off the command
     variances: Tensor  # (n_o,) where the outputs' variances stand in the state's covariance
@@ -107,12 +134,15 @@ class Predictive(ControlLaw):
         rate = None if self.rate is None else self.rate / half
         # With `operate` further PVs that the model has as outputs have ranges, too.
         n_o = n_cv if params.operate is None else model.n_y
-        run = horizon_of(model, loads, self.moves, mv_of, n_o)
+        given = params.preview == "course"
+        run = horizon_of(model, loads, self.moves, mv_of, n_o, forecasts=given)
         bounds = self._bounds(model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
         self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls, valleys=n_mv > n_cv)
         self.wanted = self._set_points(model, bounds, n_o, ramp=params.preview == "ramp")
+        self.ahead = ahead_of(signals, horizon) if given else None
+        self.known = None if self.ahead is None else KnownFuture(self.ahead, model, n_o)
         self.operation = None
         if params.operate is not None:
             self._build_operation(model, params, n_o, max(weights), middle, half)
@@ -302,8 +332,28 @@ class Predictive(ControlLaw):
         state: Tensor,
         operate: Tensor | None = None,
         fresh: Tensor | None = None,
+        ahead: Tensor | None = None,
     ) -> Stepped:
-        """One step; shapes as in ControlLaw. ``operate`` (..., n_operate), ``fresh`` (..., n_pv); None: by default."""
+        """One step; shapes as in ControlLaw.
+
+        ``operate`` (..., n_operate), ``fresh`` (..., n_pv), ``ahead`` (..., N n) of the set points and measured
+        disturbances; None: by default.
+        """
+        problem = self.problem(sp, pv, dv, mv_applied, state, operate, fresh, ahead)
+        return self.answer(problem, *self.planner(*problem.given))
+
+    def problem(
+        self,
+        sp: Tensor,
+        pv: Tensor,
+        dv: Tensor,
+        mv_applied: Tensor,
+        state: Tensor,
+        operate: Tensor | None = None,
+        fresh: Tensor | None = None,
+        ahead: Tensor | None = None,
+    ) -> PlanProblem:
+        """The problem of a step that the planner solves; arguments as of ``forward``."""
         now = self.inputs(torch.cat([sp, pv, dv, mv_applied], dim=-1).unsqueeze(-2))
         parts = torch.split(state.unsqueeze(-2), list(self.kept.values()), dim=-1)
         kept = dict(zip(self.kept, parts, strict=True))
@@ -323,28 +373,47 @@ class Predictive(ControlLaw):
         else:
             mean, boost, estimate, plan = self._estimated(now, kept)
         measured = now["v"][..., now["z"].shape[-1] :]
-        n_cv = sp.shape[-1]
         levels = [self._level(measured, kept)] if "level" in kept else []
         start = torch.cat([mean, *(levels or [measured])], dim=-1)
         past = [torch.where(kept["started"] > 0, kept[n], now["sp"]) for n in ("sp", "sp_before") if n in kept]
-        wanted = self.wanted(self._of_outputs(now["sp"]), [self._of_outputs(p) for p in past])
-        plan, ahead = self.planner(start, wanted, applied, plan, operated)
+        later, forecast = self._later(ahead)
+        wanted = self.wanted(self._of_outputs(now["sp"]), [self._of_outputs(p) for p in past], later)
+        next_kept = {"one": now["one"], "estimate": estimate, "measured": measured}
+        if levels:
+            next_kept["level"] = levels[0]
+        if past:
+            next_kept |= {"sp": now["sp"], "sp_before": past[0]}
+        asked = (start, wanted, applied, plan, operated, forecast)
+        return PlanProblem(*asked, mean, now, kept, seen, boost, next_kept, stands, mv_applied)
+
+    def answer(self, problem: PlanProblem, plan: Tensor, soon: Tensor) -> Stepped:
+        """MV, next state and info of a step with its ``plan`` (..., 1, m) and next outputs ``soon`` (..., 1, n_o)."""
+        now, stands = problem.now, problem.stands
+        n_cv, mean = len(self.signals.sp), problem.mean
         mv = (self.mv_middle + self.mv_half * plan[..., : now["z"].shape[-1]]).squeeze(-2)
-        if operated is not None:
+        if problem.operated is not None:
             # The plan is within them already; in engineering units it is so up to rounding.
-            low, high, most = (of.squeeze(-2) for of in (operated.mv_low, operated.mv_high, operated.mv_move))
+            by = problem.operated
+            low, high, most = (of.squeeze(-2) for of in (by.mv_low, by.mv_high, by.mv_move))
             mv = torch.minimum(torch.maximum(mv, low), high)
             mv = torch.minimum(torch.maximum(mv, stands - most), stands + most)
-        mv = self.limited(mv, mv_applied)
+        mv = self.limited(mv, problem.mv_applied)
         info = [
             self.load_scale * mean[..., self.observer.n_x : self.observer.n_x + self.load_scale.shape[0]],
-            self.y_center + self.y_scale * ahead[..., :n_cv],
-            boost[..., :n_cv],
+            self.y_center + self.y_scale * soon[..., :n_cv],
+            problem.boost[..., :n_cv],
         ]
-        recipe = [now["sp"], past[0]] if past else []
-        ordered = [mv.unsqueeze(-2)] if "given" in kept else []
-        state_next = torch.cat([now["one"], estimate, plan, measured, *levels, *recipe, *ordered], dim=-1).squeeze(-2)
+        one, estimate, *others = problem.next_kept.values()
+        ordered = [mv.unsqueeze(-2)] if "given" in problem.kept else []
+        state_next = torch.cat([one, estimate, plan, *others, *ordered], dim=-1).squeeze(-2)
         return mv, state_next, torch.cat(info, dim=-1).squeeze(-2)
+
+    def _later(self, ahead: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
+        """Changes by ``ahead`` of the set points over the horizon, and the horizon's offset under its disturbances."""
+        if self.known is None or ahead is None:
+            return None, None
+        later, dv = self.known(ahead)
+        return later, self.planner.horizon.forecast(dv) if dv.shape[-1] else None
 
     def _stands(self, mv_applied: Tensor, kept: Named) -> Tensor:
         """Where each MV goes on from (..., n_mv) [mv]: its last command, or the applied value where that is elsewhere.

@@ -11,14 +11,15 @@ from torch import Tensor, nn
 from torch.nn.functional import hardtanh
 
 from loopwright.pipeline.laws.base import hold_numbers
-from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, NetworkHorizon, product
+from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, NetworkHorizon, Prediction, product
 
 
 class SetPointCourse(nn.Module):
     """Set points r(k+1) .. r(k+N) from those of now and, with ``ramp``, of the two samples before.
 
-        held:  r(k+i) = r(k)
-        ramp:  r(k+i) = clip(r(k) + i s),   s = the smaller of r(k) - r(k-1) and r(k-1) - r(k-2)
+        held:    r(k+i) = r(k)
+        ramp:    r(k+i) = clip(r(k) + i s),   s = the smaller of r(k) - r(k-1) and r(k-1) - r(k-2)
+        course:  r(k+i) = r(k) + a(i),        a(i) as it is given
 
     s is 0 where the two changes differ in their signs or one is 0: a step of the set point is no ramp, and the slope
     of a recipe is believed from its second sample on. ``bounds`` are the ends of the clip: the CVs' soft limits, as a
@@ -37,14 +38,19 @@ class SetPointCourse(nn.Module):
         for name, values in {"low": low, "high": high, "samples": samples}.items():
             self.register_buffer(name, values)
 
-    def forward(self, now: Tensor, past: list[Tensor]) -> Tensor:
-        """The set points (..., 1, N n_cv), from ``now`` (..., 1, n_cv); ``past`` [r(k-1), r(k-2)] with ``ramp``."""
+    def forward(self, now: Tensor, past: list[Tensor], later: Tensor | None = None) -> Tensor:
+        """The set points (..., 1, N n_cv), from ``now`` (..., 1, n_cv); ``past`` [r(k-1), r(k-2)] with ``ramp``.
+
+        ``later`` (..., 1, N n_cv) a(1) .. a(N), where the course is given.
+        """
         course = self._held(now)
         if self.samples is not None:
             last, older = past
             change, before = now - last, last - older
             slope = torch.minimum(torch.maximum(change, before.clamp(max=0.0)), before.clamp(min=0.0))
             course = course + self.samples * self._held(slope)
+        if later is not None:
+            course = course + later
         if self.low is not None and self.high is not None:
             course = torch.minimum(torch.maximum(course, self.low), self.high)
         return course
@@ -59,7 +65,6 @@ LEAST_BEND = 1e-30  # of a cost along a direction: nothing moves
 MOST_LENGTH = 1e3  # sweeps that one step along a valley stands for
 AT_BOUND = 1e-9  # scaled: an entry this near a bound that does not move holds nothing back
 
-# --------------------------------------------------------------------------------------------------------- soft limits
 PRICE = 30.0  # of a scaled unit beyond a limit, in units of the largest weight of an error
 EPS = 0.03  # scaled: what lies beyond a limit by less counts by its square
 SOFT = 0.003  # scaled: where the curvature begins, so that the law has no jump at a limit
@@ -75,7 +80,7 @@ class LimitCost(NamedTuple):
 class OperatedPlan(NamedTuple):
     """Wishes of the operators for a plan, scaled: of outputs (..., 1, N n_o), of a plan's moves (..., 1, m)."""
 
-    track: Tensor  # 1 where a set point is followed, 0 elsewhere
+    track: Tensor  # of a set point over its designed weight; 0 where none is followed
     low: Tensor  # of the outputs' ranges
     high: Tensor
     low_inside: Tensor  # where the price of leaving it begins
@@ -134,6 +139,20 @@ class SoftLimits(nn.Module):
     def forward(self, y: Tensor) -> LimitCost:
         """The push on outputs y (..., 1, N n_cv), scaled."""
         return limit_cost(y, self.low, self.high, self.price, self.soft, self.eps_squared)
+
+
+class LastPass(NamedTuple):
+    """The quadratic problem of the last pass, and the plan that its sweeps made of the one ``before``; scaled."""
+
+    plan: Tensor  # (..., 1, m)
+    before: Tensor  # (..., 1, m)
+    run: Prediction  # under ``before``
+    wanted: Tensor  # (..., 1, N n_o) set points within the outputs' ranges
+    weight: Tensor  # (..., 1, N n_o) of the errors
+    push: LimitCost  # of the ranges
+    stiff: Tensor  # (..., m, m) curvature of the costs of moves and of being away from rests
+    low: Tensor  # (..., 1, m) least value of each move
+    high: Tensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,20 +239,27 @@ class Planner(nn.Module):
         hold_numbers(self, soft=SOFT, soft_squared=EPS**2, near=AT_BOUND)
 
     def forward(
-        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, operated: OperatedPlan | None = None
+        self,
+        start: Tensor,
+        wanted: Tensor,
+        applied: Tensor,
+        plan: Tensor,
+        operated: OperatedPlan | None = None,
+        forecast: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The plan (..., 1, m), and the outputs (..., 1, n_cv) that it gives at the next sample.
 
         From ``start`` (..., 1, n_x + n_y + n_dv), with the set points ``wanted`` (..., 1, N n_cv) over the horizon,
         the ``applied`` MV (..., 1, n_mv) within -1..1, beginning at ``plan``; all scaled. With ``operated`` as
-        operators have it, see ``_operated``.
+        operators have it, see ``_operated``. ``forecast`` is the horizon's offset where measured disturbances change.
         """
         if operated is not None:
-            return self._operated(start, wanted, applied, plan, operated)
+            last = self.last_pass(start, wanted, applied, plan, operated, forecast)
+            return last.plan, self.ahead(last)
         n_cv = self.n_cv
         held, at = applied @ self.applied, applied @ self.first
         for _ in range(self.passes):
-            run = self.horizon(start, plan)
+            run = self.horizon(start, plan, forecast)
             error = run.y - wanted
             weight = self.weights / torch.sqrt(error * error + self.eps_squared)
             push = None if self.limits is None else self.limits(run.y)
@@ -248,18 +274,29 @@ class Planner(nn.Module):
         ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
         return plan, ahead
 
-    def _operated(
-        self, start: Tensor, wanted: Tensor, applied: Tensor, plan: Tensor, by: OperatedPlan
-    ) -> tuple[Tensor, Tensor]:
+    def ahead(self, last: LastPass) -> Tensor:
+        """The outputs (..., 1, n_o) at the next sample."""
+        return last.run.y[..., : self.n_cv] + (last.plan - last.before) @ last.run.slopes[..., : self.n_cv]
+
+    def last_pass(
+        self,
+        start: Tensor,
+        wanted: Tensor,
+        applied: Tensor,
+        plan: Tensor,
+        by: OperatedPlan,
+        forecast: Tensor | None = None,
+    ) -> LastPass:
         """The plan that is best with ranges, priorities, resting values and costs, within the operators' bounds.
 
             sum_k sum_o  t_o q_o sqrt((y_o - r_o)^2 + eps^2) + p_o(b_o) + c_o y_o
             + mu s sum_j |z_j - z_{j-1}|^2 + sum_j w_j (z_j - rest)^2/2 + c_j z_j
 
-        t is 1 for a set point that is followed, b_o what lies beyond the range of output o, p_o the cost of
+        t is the weight of a set point over the designed one, 0 where none is followed, b_o what lies beyond the range
+        of output o, p_o the cost of
         ``SoftLimits`` with its price by rank, s the stiffness. A set point outside its range counts as the end of it.
         """
-        n_cv, stiff = self.n_cv, by.stiffness * self.moved + by.rest_weight * self.eye
+        stiff = by.stiffness * self.moved + by.rest_weight * self.eye
         at = applied @ self.first
         held = by.stiffness * (applied @ self.applied) + by.rest_weight * by.rest - by.z_cost
         wanted, weights = torch.minimum(torch.maximum(wanted, by.low), by.high), self.weights * by.track
@@ -270,7 +307,7 @@ class Planner(nn.Module):
         )
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         for _ in range(self.passes):
-            run = self.horizon(start, plan + by.off)
+            run = self.horizon(start, plan + by.off, forecast)
             error = run.y - wanted
             weight = weights / torch.sqrt(error * error + self.eps_squared)
             push = limit_cost(run.y, by.low_inside, by.high_inside, by.price, self.soft, self.soft_squared)
@@ -283,8 +320,7 @@ class Planner(nn.Module):
                 plan = self._descended_within(curvature, pull, plan, middle, half)
             else:
                 plan = self.descended(curvature, pull, plan, at, (low, high, by.rate))
-        ahead = run.y[..., :n_cv] + (plan - before) @ run.slopes[..., :n_cv]
-        return plan, ahead
+        return LastPass(plan, before, run, wanted, weight, push, stiff, low, high)
 
     def _damped(
         self, weighed: Tensor, slopes_t: Tensor, stiff: Tensor, pull: Tensor, plan: Tensor
@@ -368,12 +404,12 @@ class Planner(nn.Module):
                 for p in range(m):
                     plan = hardtanh(product(plan, into[p], add[p]))
                 continue
-            low, high = self._ends(product(plan, self.before, at), bounds)
+            low, high = self.ends(product(plan, self.before, at), bounds)
             for p in range(m):
                 plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
         return plan
 
-    def _ends(self, middle: Tensor, bounds: tuple[Tensor, Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
+    def ends(self, middle: Tensor, bounds: tuple[Tensor, Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
         """The ends of each move, whose move before is at ``middle`` (..., 1, m); ``bounds`` as in ``descended``."""
         if bounds is not None:
             least, most, rate = bounds

@@ -9,6 +9,7 @@ import numpy as np
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.fresh_errors import changes_of, deviation_of
 from loopwright.pipeline.models.identified.innovations import (
     Innovations,
     PredictionError,
@@ -343,6 +344,5 @@ def misses(model: Dynamics, starts: list[Array], train: list[Stretch], ratio: fl
     found = residuals(model, starts, train, correction)
     if found is None:
         return True
-    whole = np.concatenate(found).std(axis=0)
-    fast = np.concatenate([np.diff(r, axis=0) for r in found]).std(axis=0) / np.sqrt(2)
+    whole, fast = deviation_of(found), deviation_of(changes_of(found)) / np.sqrt(2)
     return bool(np.any(whole > ratio * fast))

@@ -44,6 +44,7 @@ def run_rows(
     y: Array,
     correction: float,
     gain: Array,
+    seen: NDArray[np.bool_],
     x: Array,
     limit: float,
     before: Array,
@@ -54,7 +55,8 @@ def run_rows(
         z(k) = matrix x'(k) + drive(k),   x(k+1) = z[:n_x] + W2 tanh(z[n_x:])
 
     ``matrix`` (n_x + n_h, n_x), ``drive`` (n, n_x + n_h). x' is x, its outputs corrected by ``correction`` (y - x), all
-    states by ``gain`` (y - x) where there is a gain (n_x, n_y), else (n_x, 0).
+    states by ``gain`` (y - x) where there is a gain (n_x, n_y), else (n_x, 0). Outputs that are not ``seen`` (n, n_y)
+    in a row correct nothing.
     """
     n_x = matrix.shape[1]
     n_h = matrix.shape[0] - n_x
@@ -68,11 +70,13 @@ def run_rows(
             before[k, i] = x[i]
         if correction != 0.0:
             for i in range(n_y):
-                x[i] += correction * (y[k, i] - x[i])
+                if seen[k, i]:
+                    x[i] += correction * (y[k, i] - x[i])
         if corrects:
             for i in range(n_x):
                 for j in range(n_y):
-                    x[i] += gain[i, j] * (y[k, j] - before[k, j])
+                    if seen[k, j]:
+                        x[i] += gain[i, j] * (y[k, j] - before[k, j])
         for i in range(n_x):
             after[k, i] = x[i]
         for h in range(n_h):
@@ -100,6 +104,7 @@ def propagate(
     keep: float,
     gain: Array,
     e: Array,
+    seen: NDArray[np.bool_],
     parameters: bool,
     s: Array,
     jac: Array,
@@ -109,6 +114,7 @@ def propagate(
         S(k+1) = dF/dx S'(k) + dF/dtheta(k),   S' = S but for the outputs: keep S[:n_y]
 
     With a ``gain`` L (n_x, n_y) and the innovations ``e`` (m, n_y), S' = S - L S[:n_y] + dL/dtheta e; else (n_x, 0).
+    Outputs that are not ``seen`` (m, n_y) in a row correct nothing there.
 
     ``z`` (m, n_x + n_v) holds the states and inputs of the rows, ``t`` (m, n_h) the tanh units there. The columns are
     the parameters in the order of ``Dynamics.vector`` (none without ``parameters``), then the initial state.
@@ -127,6 +133,8 @@ def propagate(
             for c in range(width):
                 jac[k, i, c] = s[i, c]
         for j in range(gain.shape[1]):
+            if not seen[k, j]:
+                continue
             for i in range(n_x):
                 for c in range(width):
                     s[i, c] -= gain[i, j] * jac[k, j, c]
@@ -137,7 +145,7 @@ def propagate(
                 total = a[i, j]
                 for h in range(n_h):
                     total += w2[i, h] * (1 - t[k, h] * t[k, h]) * w1[h, j]
-                slope[i, j] = total * keep if j < n_y else total
+                slope[i, j] = total * keep if j < n_y and seen[k, j] else total
         for i in range(n_x):
             for c in range(width):
                 ahead[i, c] = 0.0
@@ -201,13 +209,32 @@ EXPLODED_STATE = 1e4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stretch:
-    """Neighbouring rows of one run, scaled: outputs y (n, n_y) and the inputs v (n, n_v) that act in these rows."""
+    """Neighbouring rows of one run, scaled: outputs y (n, n_y) and the inputs v (n, n_v) that act in these rows.
+
+    ``fresh`` (n, n_y) says which outputs are new readings; None: all are. Only these count in an error.
+    """
 
     y: Array
     v: Array
+    fresh: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.y)
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Outputs (n, n_y) that are new readings."""
+        return np.ones(self.y.shape, dtype=np.bool_) if self.fresh is None else np.ascontiguousarray(self.fresh)
+
+    @property
+    def count(self) -> int:
+        """Number of new readings."""
+        return self.y.size if self.fresh is None else int(np.count_nonzero(self.fresh))
+
+    def errors(self, predicted: Array) -> Array:
+        """Errors y - predicted (n, n_y), NaN where an output is no new reading."""
+        left = self.y - predicted
+        return left if self.fresh is None else np.where(self.fresh, left, np.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,7 +339,7 @@ class Dynamics(StateEquation):
             drive = np.concatenate([data.v @ b + self.c, data.v @ w1 + self.b1], axis=1)
             before, after = np.empty((len(data), n_x)), np.empty((len(data), n_x))
             y, x = np.ascontiguousarray(data.y), np.asarray(start, dtype=np.float64)
-            kept = run_rows(matrix, w2, drive, y, correction, gain, x, EXPLODED_STATE, before, after)
+            kept = run_rows(matrix, w2, drive, y, correction, gain, data.seen, x, EXPLODED_STATE, before, after)
             return (before, after) if kept else None
 
         return run

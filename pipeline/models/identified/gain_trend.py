@@ -86,7 +86,8 @@ def gain_trends(model: Dynamics, data: Sequence[Stretch], n_mv: int) -> list[lis
             if first is None or second is None:
                 return []
             columns += [first, second, first * rows]
-        found.append(_changes(np.column_stack(columns), left[:, i]))
+        read = np.isfinite(left[:, i])
+        found.append(_changes(np.column_stack(columns)[read], left[read, i]))
     return found
 
 

@@ -14,6 +14,7 @@ from loopwright.pipeline.dynamics.step_response import ANSWER_PERIODS, answers_a
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.dynamics import Dynamics
+from loopwright.pipeline.models.identified.fresh_errors import changes_of, deviation_of
 from loopwright.pipeline.models.identified.scaled_record import ScaledRecord, Scales
 from loopwright.pipeline.models.identified.steady_states import central_map, rest_map
 from loopwright.pipeline.plants.simulator import Array
@@ -135,13 +136,41 @@ def remembering(model: Dynamics, delays: Sequence[int]) -> Dynamics:
     return Dynamics(a, b, c, w1, model.b1, w2)
 
 
+def handed_over(model: Dynamics, late: Sequence[int]) -> Dynamics:
+    """The model whose output i comes ``late[i]`` periods later, as an analyser's numbers do.
+
+    x = [outputs as they come, other states of the model, late outputs as they are, past ones, newest first]
+    """
+    order, total = handing_order(model.n_x, late), int(sum(late))
+    n, n_v = model.n_x, model.n_v
+    a, b, c = np.zeros((n + total, n + total)), np.zeros((n + total, n_v)), np.zeros(n + total)
+    w1, w2 = np.zeros((model.n_hidden, n + total + n_v)), np.zeros((n + total, model.n_hidden))
+    a[:n, :n], b[:n], c[:n], w2[:n] = model.a, model.b, model.c, model.w2
+    at = n
+    for i, d in enumerate(late):
+        if d:
+            a[at, i] = 1.0
+            a[at + 1 : at + d, at : at + d - 1] = np.eye(d - 1)
+            at += d
+    w1[:, :n], w1[:, n + total :] = model.w1[:, :n], model.w1[:, n:]
+    w1 = np.hstack([w1[:, order], w1[:, n + total :]])
+    return Dynamics(a[np.ix_(order, order)], b[order], c[order], w1, model.b1, w2[order])
+
+
+def handing_order(n_x: int, late: Sequence[int]) -> list[int]:
+    """Places of the states of ``handed_over`` in [x of the model, past values of each late output, newest first]."""
+    firsts = [n_x + sum(late[:i]) for i in range(len(late))]
+    ends = [first + d - 1 if d else i for i, (first, d) in enumerate(zip(firsts, late, strict=True))]
+    others = [k for k in range(n_x + sum(late)) if k not in ends]
+    return [*ends, *others]
+
+
 def noise_of(residuals: Sequence[Array]) -> Array:
     """Standard deviation (n_y,) of the measurement noise from free-run residuals (n, n_y) of each stretch.
 
     min(sd of the differenced residual / sqrt 2, sd of the residual): what the model misses is mostly slow.
     """
-    differenced = np.concatenate([np.diff(r, axis=0) for r in residuals]).std(axis=0) / np.sqrt(2)
-    return np.asarray(np.minimum(differenced, np.concatenate(list(residuals)).std(axis=0)))
+    return np.asarray(np.minimum(deviation_of(changes_of(residuals)) / np.sqrt(2), deviation_of(residuals)))
 
 
 def assemble_model(
@@ -152,8 +181,9 @@ def assemble_model(
     known: Mapping[str, Array],
     n_mv: int,
     seed: int,
+    late: Sequence[int] = (),
 ) -> Identified:
-    """The finished model of fitted ``model`` under inputs late by ``delays`` (n_v,).
+    """The finished model of fitted ``model`` under inputs late by ``delays`` (n_v,), outputs by ``late`` (n_y,).
 
     ``known`` are its scaled ``noise`` (n_y,), the noise's ``colour``, the ``load_moves`` (n, n_y) of the record, the
     ``dv_noise`` and ``dv_change`` of its measured disturbances, and what the record leaves open: ``gain_sd``,
@@ -165,6 +195,14 @@ def assemble_model(
     rest, rest_cov = np.zeros((total, n_y + n_v + 1)), np.zeros((total, total))
     rest[:n], rest_cov[:n, :n] = table, covariance
     rest[n:, n_y : n_y + n_v] = np.repeat(np.eye(n_v), delays, axis=0)
+    late = tuple(late) or (0,) * n_y
+    if any(late):
+        order = handing_order(total, late)
+        past = np.repeat(np.eye(n_y, n_y + n_v + 1), late, axis=0)
+        rest = np.vstack([rest, past])[order]
+        rest_cov = np.pad(rest_cov, (0, sum(late)))[np.ix_(order, order)]
+        whole = handed_over(whole, late)
+        total = whole.n_x
     config = {"n_y": n_y, "n_mv": n_mv, "n_dv": n_v - n_mv, "n_x": total, "n_hidden": model.n_hidden}
     config["recorded"] = len(known["load_moves"])
     arrays = {
@@ -173,7 +211,8 @@ def assemble_model(
         **known,
         "rest": rest,
         "rest_cov": rest_cov,
-        "dead": dead_periods(pair_answers(model, data))[:n_mv] + np.asarray(delays[:n_mv], dtype=np.float64),
+        "dead": dead_periods(pair_answers(model, data) + np.asarray(late))[:n_mv]
+        + np.asarray(delays[:n_mv], dtype=np.float64),
     }
     return Identified.from_arrays(config, arrays)
 

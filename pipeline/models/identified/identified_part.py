@@ -9,9 +9,11 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from loopwright.pipeline.config.known import NONE
+from loopwright.pipeline.historian.analyser_readings import Aligned
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.candidates import on_all_rows, within_limits
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.fresh_errors import rms
 from loopwright.pipeline.models.identified.gain_trend import GainTrend, gain_trends
 from loopwright.pipeline.models.identified.identified import Identified, assemble_model, noise_of
 from loopwright.pipeline.models.identified.innovations import Innovations, innovations, load_moves, noise_of_filter
@@ -143,7 +145,7 @@ class IdentifiedPart(Part):
         drawn_ones = _as_likely(problem, structure, fitted.model, source.seed)
         bands, weights = [*fits, *drawn_ones], np.r_[weights, np.ones(len(drawn_ones))]
         # The gains belong to the middle of the whole record, also where only a part of its rows is fitted.
-        record = source.data(self.model.kind)
+        record = Aligned.of(source.data(self.model.kind), n_y).record
         measured = searched.disturbances
         rows, names = measured.smoothed(ScaledRecord.of(record, scales)), [s.name for s in pvs]
         runs, predictions = free_run_figures(problem, selection.chosen, scales, names)
@@ -163,7 +165,9 @@ class IdentifiedPart(Part):
         disturbances = {"dv_noise": measured.noise, "dv_change": measured.change}
         loads = {"load_moves": _load_moves(fitted.model, whole)}
         known = {"noise": noise, "colour": colour, **loads, **disturbances, **open_to}
-        model = assemble_model(fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed)
+        model = assemble_model(
+            fitted.model.plant, structure.delays, scales, problem.data, known, n_mv, source.seed, searched.late
+        )
         for name, sd in zip(runs, noise * scales.y_scale, strict=True):
             runs[name]["noise_sd"] = float(sd)
         for name, phi in zip(runs, colour, strict=True):
@@ -183,7 +187,7 @@ class IdentifiedPart(Part):
             for mv, trend in zip(source.signals.mv, row, strict=True):
                 of = gain_table[pv.name][mv.name]
                 of["trend"] = trend._asdict() | {"certain": trend.certain, "at_end": trend.at_end * of["gain"]}
-        answers = answer_figures(fitted.model.plant, structure.delays, problem.data, pvs, inputs)
+        answers = answer_figures(fitted.model.plant, structure.delays, problem.data, pvs, inputs, searched.late)
         delays = _delays(selection, inputs, answers["first_answers"])
         said = {"known": known_figures(searched.known, gain_table, record, delays)} if searched.known else {}
         metrics: dict[str, Any] = {
@@ -192,6 +196,7 @@ class IdentifiedPart(Part):
             "parameters": int(np.count_nonzero(fitted.model.free())),
             "member": self.member,
             "outputs": runs,
+            **({"late": dict(zip(names, searched.late, strict=True))} if any(searched.late) else {}),
             "structure": structure_figures(selection, _unseen(source.signals.mv, rows, scales)),
             "gains": gain_table,
             **answers,
@@ -208,7 +213,7 @@ class IdentifiedPart(Part):
                 for s, sd in zip(source.signals.dv, measured.noise * scales.v_scale[n_mv:], strict=True)
             },
             "residual": residual_figures(found, [s.v for s in whole], [s.name for s in pvs]),
-            "step_responses": response_figures(curves, structure.delays, rows, scales, pvs, inputs),
+            "step_responses": response_figures(curves, structure.delays, rows, scales, pvs, inputs, searched.late),
             "candidates_tried": _table(selection),
         }
         time_s: Array = source.signals.period_s * np.arange(len(predictions["measured"]), dtype=np.float64)
@@ -360,7 +365,7 @@ def _as_likely(problem: Problem, structure: Structure, model: Dynamics, seed: in
     whole = problem.whole(structure)
     errors = innovations(model, whole) if isinstance(model, Innovations) else None
     if isinstance(model, Innovations) and errors is not None:
-        size = np.sqrt(np.mean(errors**2, axis=0))
+        size = rms(errors)
         near, parts = model.rescaled(size), [replace(s, y=s.y / size) for s in whole]
         return [
             of.rescaled(1 / size).plant for of in drawn(near, fit_starts(near, parts), parts, BAND_DRAWS, seed=seed)

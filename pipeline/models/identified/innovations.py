@@ -18,6 +18,7 @@ from scipy import linalg
 
 from loopwright.pipeline.errors import ModelError
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.fresh_errors import covariance_of, rms
 from loopwright.pipeline.models.identified.output_error import Fitted, OutputErrorFit, fit_starts, residuals
 from loopwright.pipeline.plants.simulator import Array
 
@@ -156,7 +157,7 @@ def forgetting(model: Innovations, covariance: Array) -> Innovations:
 
 
 def innovations(model: Dynamics, data: Sequence[Stretch]) -> Array | None:
-    """One-step errors (n, n_y) over rows that count; None where the filter explodes.
+    """One-step errors (n, n_y) over rows that count, NaN where nothing is read; None where the filter explodes.
 
     The filter starts from the first outputs with all else at zero, and ``BURN_IN`` of each stretch, 20 to 300 rows,
     goes by before its errors count; of a stretch that is no longer the second half does.
@@ -167,14 +168,15 @@ def innovations(model: Dynamics, data: Sequence[Stretch]) -> Array | None:
         run = _filtered(model, stretch)
         if run is None:
             return None
-        found.append((stretch.y - run[:, :n_y])[_begins(stretch) :])
+        found.append(stretch.errors(run[:, :n_y])[_begins(stretch) :])
     return np.concatenate(found)
 
 
 def ahead(model: Innovations, stretch: Stretch, rows: int = PREDICTED_AHEAD) -> tuple[Array, Array]:
     """(measured, predicted) (n, n_y) over the rows that count, predicted 1 to ``rows`` rows ahead in turn.
 
-    Every ``rows`` rows a run without correction begins from the filter's state. Not finite where one explodes.
+    Measured is NaN where an output is no new reading. Every ``rows`` rows a run without correction begins from the
+    filter's state. Not finite where one explodes.
     """
     n_y, begins = stretch.y.shape[1], _begins(stretch)
     states, free = _filtered(model, stretch), replace(model, gain=np.zeros_like(model.gain))
@@ -184,7 +186,7 @@ def ahead(model: Innovations, stretch: Stretch, rows: int = PREDICTED_AHEAD) -> 
         run = None if states is None else free.free_run(states[first], Stretch(stretch.y[part], stretch.v[part]))
         if run is not None:
             predicted[part] = run[0][:, :n_y]
-    return stretch.y[begins:], predicted[begins:]
+    return stretch.errors(np.zeros_like(stretch.y))[begins:], predicted[begins:]
 
 
 def load_moves(model: Innovations, data: Sequence[Stretch]) -> Array:
@@ -213,10 +215,12 @@ def _begins(stretch: Stretch) -> int:
 
 
 def typical(errors: Array | None) -> float:
-    """Geometric mean over the outputs of the rms of errors (n, n_y): their log variances count alike."""
+    """Geometric mean over the outputs of the rms of errors (n, n_y): their log variances count by their readings."""
     if errors is None:
         return np.inf
-    return float(np.exp(np.mean(np.log(np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-12)))))
+    sizes, count = np.log(np.maximum(rms(errors), 1e-12)), np.isfinite(errors).sum(axis=0)
+    # An output counts by its readings, as in the log-likelihood.
+    return float(np.exp(np.mean(sizes) if count.min() == count.max() else np.average(sizes, weights=count)))
 
 
 def begun(plant: Dynamics, data: Sequence[Stretch]) -> Innovations:
@@ -263,7 +267,7 @@ class PredictionError:
         errors = innovations(model, data)
         if errors is None:
             raise ModelError("the filter of the model explodes over its own training rows; record more samples")
-        size = np.maximum(np.sqrt(np.mean(errors**2, axis=0)), 1e-9)
+        size = np.maximum(rms(errors), 1e-9)
         near, whole = model.rescaled(size), float(np.exp(np.mean(np.log(size))))
         train, late = ([replace(s, y=s.y / size) for s in of] for of in (data, held))
 
@@ -278,7 +282,7 @@ class PredictionError:
         unit = np.ones(model.n_x)
         unit[: len(size)] = unit[model.n_x - len(size) :] = size
         left = np.concatenate(residuals(found.model, found.starts, train) or [errors / size])
-        inner, starts, held_out = forgetting(found.model, left.T @ left / len(left)), found.starts, found.held_out
+        inner, starts, held_out = forgetting(found.model, covariance_of(left)), found.starts, found.held_out
         if inner is not found.model:
             starts, held_out = fit_starts(inner, train), judge(inner)
         model, starts = _about_mean_loads(inner.rescaled(1 / size), [x * unit for x in starts], data)
@@ -305,7 +309,7 @@ def noise_of_filter(model: Innovations, errors: Array) -> Array:
     The filter's gain at the outputs is L = P (P + R)^-1 and the variance of e is P + R; so R = (I - L) cov(e).
     """
     n_y = errors.shape[1]
-    covariance = errors.T @ errors / max(len(errors), 1)
+    covariance = covariance_of(errors)
     left = (np.eye(n_y) - model.gain[:n_y]) @ covariance
     # A filter that believes the measurement wholly still leaves the digits of the transmitter.
     return np.asarray(np.sqrt(np.maximum(np.diag(left), LEAST_NOISE_SHARE * np.diag(covariance))))

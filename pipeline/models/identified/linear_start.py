@@ -48,13 +48,18 @@ class HighOrder:
         return h
 
     def one_step_errors(self, data: ScaledRecord) -> Array:
-        """Errors (n, n_y) of its one-step predictions of the rows that have a whole past, about their mean."""
+        """Errors (n, n_y) of its one-step predictions of the rows that have a whole past, about their mean.
+
+        NaN where an output is no new reading.
+        """
         n = len(self.a)
         k = np.concatenate([np.arange(i + n - 1, j - 1) for i, j in data.bounds()])
         errors = data.y[k + 1].copy()
         for i in range(n):
             errors -= data.y[k - i] @ self.a[i].T + data.v[k - i] @ self.b[i].T
-        return np.asarray(errors - errors.mean(axis=0))
+        if data.fresh is not None:
+            errors[~data.fresh[k + 1]] = np.nan
+        return np.asarray(errors - np.nanmean(errors, axis=0))
 
 
 def high_order_arx(data: ScaledRecord, lags: int | None = None) -> HighOrder:

@@ -17,6 +17,7 @@ import numpy as np
 from loopwright.pipeline.config.known import CONTRADICTION_SDS
 from loopwright.pipeline.historian.answers import DirectModel
 from loopwright.pipeline.historian.feedback import follows
+from loopwright.pipeline.models.identified.fresh_errors import rms
 from loopwright.pipeline.models.identified.innovations import innovations
 from loopwright.pipeline.models.identified.linear_start import high_order_arx
 from loopwright.pipeline.models.identified.parameter_uncertainty import weighted_interval
@@ -171,7 +172,7 @@ def proven_answers(
         late = {j: 1 + structure.delays[j] - int(structure.same_row) for j in used}
         places = {j: _place(middle[j, :, i], late[j]) for j in used}
         longest = max([LEAST_LAGS, *(last for *_, last in places.values())])
-        direct = [DirectModel.of(part.y[:, i], part.v, part.run, longest) for part in parts]
+        direct = [DirectModel.of(part.y[:, i], part.v, part.run, longest, part.read(i)) for part in parts]
         surprise[i] = np.inf if direct[0] is None else direct[0].sd
         for j, (at, first, last) in places.items():
             found[i, j] = _answer(unit[:, j, at, i].mean(axis=1), weights, direct, j, first, last)
@@ -207,7 +208,7 @@ def _regions(
             columns[j] = sum(of.shape[1] for of in inputs)
             knots = [cut[j][1][group.start] for group in cut[j][0][1:]] if j in cut else []
             inputs.append(pieces(values, knots))
-        models.append(DirectModel.of(part.y[:, i], np.hstack(inputs), part.run, longest))
+        models.append(DirectModel.of(part.y[:, i], np.hstack(inputs), part.run, longest, part.read(i)))
     found = {}
     for j, (groups, edges, of_cells, first, last) in cut.items():
         width, strongest = np.diff(edges), np.abs(weighted_interval(of_cells, weights)[1]).max()
@@ -273,15 +274,15 @@ def foreseen(
         both = [high_order_arx(of.rows(fold.train)).one_step_errors(of.rows(fold.held)) for of in (rows, alone)]
         parts.append([np.full((1, n_y), np.inf) if errors is None else errors, *both])
     found = [np.concatenate(of) for of in zip(*parts, strict=True)]
-    model_sd, with_sd, without_sd = (np.sqrt(np.mean(e**2, axis=0)) for e in found)
-    n = len(found[2])
+    model_sd, with_sd, without_sd = map(rms, found)
+    counts = np.isfinite(found[2]).sum(axis=0).tolist()
     return {
         name: {
             "model": float(model_sd[i] * y_scale[i]),
             "with_inputs": float(with_sd[i] * y_scale[i]),
             "without": float(without_sd[i] * y_scale[i]),
-            "rows": n,
-            "nats": float(n * np.log(without_sd[i] / with_sd[i])),
+            "rows": counts[i],
+            "nats": float(counts[i] * np.log(without_sd[i] / with_sd[i])),
         }
         for i, name in enumerate(names)
     }

@@ -70,8 +70,8 @@ TRAINED = 60
 
 def nats(problem: Problem, trial: CandidateFits, better: CandidateFits) -> float:
     """Log-likelihood of the held-out rows by which a trial is worse than a better one, n_y n log(e/e')."""
-    rows = sum(problem.folds[k].held.stop - problem.folds[k].held.start for k in trial.folds)
-    return float(problem.data.y.shape[1] * rows * np.log(trial.error / better.error))
+    readings = sum(problem.data.rows(problem.folds[k].held).readings for k in trial.folds)
+    return float(readings * np.log(trial.error / better.error))
 
 
 def worse(problem: Problem, trial: CandidateFits, best: CandidateFits) -> float:
@@ -87,7 +87,7 @@ def behind(problem: Problem, trial: CandidateFits, best: CandidateFits) -> float
     They have as many parameters, so that the rows of a fit count too. The held-out ones alone are few: 4 nats for a
     dead time that is not there were seen in noise of 10 %.
     """
-    rows = problem.data.y.shape[1] * len(problem.data.y)
+    rows = problem.data.readings
     ratio = _of_all_rows(problem, trial) / _of_all_rows(problem, best)
     return float(rows * np.log(ratio)) + trial.structure.order - best.structure.order
 

@@ -11,6 +11,7 @@ from scipy import linalg
 from scipy.linalg import lapack
 
 from loopwright.pipeline.models.identified.dynamics import EXPLODED_STATE, Dynamics, Stretch, propagate
+from loopwright.pipeline.models.identified.fresh_errors import rms, sum_of_squares
 from loopwright.pipeline.plants.simulator import Array
 
 # ------------------------------------------ sensitivities of free runs, summed to the equations of a Gauss-Newton step
@@ -81,7 +82,7 @@ def sensitivity_sums(
         if run is None:
             return None
         predicted, from_states = run
-        n_y = stretch.y.shape[1]
+        n_y, all_seen = stretch.y.shape[1], stretch.seen
         own = np.zeros((n_free + n_x, n_free + n_x))
         blocks: list[Array] = []
         width = (len(free) if n_free else 0) + n_x
@@ -92,8 +93,12 @@ def sensitivity_sums(
             z = np.concatenate([from_states[rows], stretch.v[rows]], axis=1)
             history = np.empty((len(z), n_y, width))
             t = np.tanh(z @ model.w1.T + model.b1)
-            missed = stretch.y[rows] - predicted[rows, :n_y]
-            propagate(a, w1, w2, z, t, 1 - correction, gain, missed, n_free > 0, s, history)
+            missed, seen = stretch.y[rows] - predicted[rows, :n_y], all_seen[rows]
+            if stretch.fresh is not None:
+                missed[~seen] = 0.0
+            propagate(a, w1, w2, z, t, 1 - correction, gain, missed, seen, n_free > 0, s, history)
+            if stretch.fresh is not None:
+                history[~seen] = 0.0
             jac = history.reshape(-1, width)
             if 0 < n_free < len(free):
                 jac = jac[:, columns]
@@ -118,20 +123,20 @@ DAMPING_GROWTH = 1e10  # of the damping, after which no step is looked for
 def residuals(
     model: Dynamics, starts: Sequence[Array], data: Sequence[Stretch], correction: float = 0.0
 ) -> list[Array] | None:
-    """Residuals y - y_hat (n, n_y) of each stretch; None where a free run explodes."""
+    """Residuals y - y_hat (n, n_y) of each stretch, NaN where nothing is read; None where a free run explodes."""
     found, free_run = [], model.runner(correction)
     for start, stretch in zip(starts, data, strict=True):
         run = free_run(start, stretch)
         if run is None:
             return None
-        found.append(stretch.y - run[0][:, : stretch.y.shape[1]])
+        found.append(stretch.errors(run[0][:, : stretch.y.shape[1]]))
     return found
 
 
 def squares(model: Dynamics, starts: Sequence[Array], data: Sequence[Stretch], correction: float = 0.0) -> float:
     """Sum of squared residuals over all stretches; infinite where a free run explodes."""
     found = residuals(model, starts, data, correction)
-    return np.inf if found is None else float(sum(np.vdot(r, r) for r in found))
+    return np.inf if found is None else sum_of_squares(found)
 
 
 def fit_starts(
@@ -198,7 +203,7 @@ def free_run_error(
     found = residuals(model, starts, data, correction)
     if found is None:
         return np.full(data[0].y.shape[1], np.inf), starts
-    return np.sqrt(np.mean(np.concatenate(found) ** 2, axis=0)), starts
+    return rms(np.concatenate(found)), starts
 
 
 def overall(errors: Array) -> float:
@@ -260,7 +265,7 @@ class OutputErrorFit:
         free = model.free() if free is None else free
         starts = fit_starts(model, data, self.correction) if starts is None else list(starts)
         judge = self._judge(held) if judge is None else judge
-        n = sum(s.y.size for s in data)
+        n = sum(s.count for s in data)
         loss = squares(model, starts, data, self.correction)
         best = Fitted(model, starts, float(np.sqrt(loss / n)), judge(model), 0)
         mu, grow, since, flat, work = -1.0, 2.0, 0, 0, 0

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from loopwright.pipeline.dynamics.step_response import GOES_ON, late_change, reached
 from loopwright.pipeline.historian.settling import MOST_PERIODS
 from loopwright.pipeline.models.identified.dynamics import Dynamics, Stretch
+from loopwright.pipeline.models.identified.fresh_errors import changes_of, deviation_of, sum_of_squares
 from loopwright.pipeline.models.identified.output_error import residuals, sensitivity_sums
 from loopwright.pipeline.plants.simulator import Array
 
@@ -89,11 +90,11 @@ def colour_of(residuals: Sequence[Array]) -> Array:
     The differences hide what a model misses slowly. Their standard deviation is that of the noise times
     sqrt(2 (1 - phi)); phi is no larger than the residual's own standard deviation allows.
     """
-    changes = [np.diff(r, axis=0) for r in residuals]
-    power = np.sum([(c**2).sum(axis=0) for c in changes], axis=0)
-    lagged = np.sum([(c[1:] * c[:-1]).sum(axis=0) for c in changes], axis=0)
-    white = np.concatenate(changes).var(axis=0) / 2
-    most = 1 - white / np.maximum(np.concatenate(list(residuals)).var(axis=0), 1e-300)
+    changes = changes_of(residuals)
+    power = np.sum([np.nansum(c**2, axis=0) for c in changes], axis=0)
+    lagged = np.sum([np.nansum(c[1:] * c[:-1], axis=0) for c in changes], axis=0)
+    white = deviation_of(changes) ** 2 / 2
+    most = 1 - white / np.maximum(deviation_of(residuals) ** 2, 1e-300)
     found = np.where(power > 0, 1 + 2 * lagged / np.maximum(power, 1e-300), 0.0)
     return np.clip(found, 0.0, np.clip(most, 0.0, MOST_COLOUR))
 
@@ -138,7 +139,7 @@ def drawn(
     values, vectors = np.linalg.eigh((h + h.T) / 2)
     kept = values > UNSEEN_EIGENVALUE * values[-1]
     spread = (vectors[:, kept] / values[kept]) @ (vectors[:, kept].T @ (blocks - blocks.mean(axis=0)).T)
-    limit = UNLIKELY_ERROR**2 * sum(float(np.vdot(r, r)) for r in found)
+    limit = UNLIKELY_ERROR**2 * sum_of_squares(found)
     rng = np.random.default_rng(seed)
     models = []
     for _ in range(count):
@@ -148,7 +149,7 @@ def drawn(
             theta[free] += step
             candidate = model.with_vector(theta)
             runs = residuals(candidate, starts, data, correction)
-            if runs is not None and sum(float(np.vdot(r, r)) for r in runs) < limit:
+            if runs is not None and sum_of_squares(runs) < limit:
                 models.append(candidate)
                 break
             step = step / 2

@@ -33,10 +33,18 @@ def curved(model: Dynamics, starts: Sequence[Array], data: Sequence[Stretch], co
         return False
     pairs = [(run, part) for run, part in zip(runs, data, strict=True) if run is not None]
     n_y = data[0].y.shape[1]
-    left = np.concatenate([part.y[1:] - before[1:, :n_y] for (before, _), part in pairs])
+    left = np.concatenate([part.errors(before[:, :n_y])[1:] for (before, _), part in pairs])
     z = np.concatenate([np.hstack([after, part.v])[:-1] for (_, after), part in pairs])
     straight, bent = _columns(z)
-    n, p, more = len(z), straight.shape[1], bent.shape[1]
+    if not np.isnan(left).any():
+        return _bends(straight, bent, left)
+    known = np.isfinite(left)
+    return any(_bends(straight[of], bent[of], left[of, i : i + 1]) for i, of in enumerate(known.T))
+
+
+def _bends(straight: Array, bent: Array, left: Array) -> bool:
+    """Whether columns (n, q) beside those of lines (n, p) explain a residual (n, n_y) by more than chance."""
+    n, p, more = len(left), straight.shape[1], bent.shape[1]
     if n < 2 * (p + more):
         return False
     without, beside = _squares_left(straight, left), _squares_left(np.hstack([straight, bent]), left)
@@ -108,7 +116,12 @@ def drift_of(model: Dynamics, data: Sequence[Stretch]) -> Drift:
         return none
     found = [none]
     for i in range(data[0].y.shape[1]):
-        both = [(part.y[:, i], run[0][:, i]) for part, run in zip(data, runs, strict=True) if run is not None]
+        both = [
+            (part.y[of, i], run[0][of, i])
+            for part, run in zip(data, runs, strict=True)
+            if run is not None
+            for of in (part.seen[:, i],)
+        ]
         floor = float(np.mean(np.concatenate([np.diff(y - predicted) for y, predicted in both]) ** 2)) / 2
         y, predicted = (np.concatenate(series) for series in zip(*both, strict=True))
         power = float(np.mean(_beyond(y, predicted, len(y)) ** 2))
@@ -140,8 +153,12 @@ def error_beyond_drift(model: Dynamics, data: Sequence[Stretch], part: int) -> f
         run = model.free_run(start, stretch)
         if run is None:
             return np.inf
-        found.append(np.column_stack([_beyond(stretch.y[:, i], run[0][:, i], part) for i in range(n_y)]))
-    return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
+        left = stretch.errors(run[0][:, :n_y])
+        for i, of in enumerate(np.isfinite(left).T):
+            # The parts of an output with fewer readings last as long, and hold fewer.
+            left[of, i] = _beyond(stretch.y[of, i], run[0][of, i], max(round(part * of.mean()), 2))
+        found.append(left)
+    return float(np.sqrt(np.nanmean(np.concatenate(found) ** 2)))
 
 
 def _beyond(y: Array, predicted: Array, part: int) -> Array:
@@ -172,23 +189,28 @@ def residual_figures(
 
     ``autocorrelated`` over lags 1 .. 25, ``input_correlated`` with the inputs at lags 0 .. 25; .01 is what chance
     gives. A share of the second far above that says that dynamics are missing; the first also sees coloured noise.
+    Where an output is not read in each row, residuals are NaN, and the lags of the first count its readings.
     """
-    e = np.concatenate([r - r.mean(axis=0) for r in residuals])
+    e = np.concatenate([r - np.nanmean(r, axis=0) for r in residuals])
     v = np.concatenate([u - u.mean(axis=0) for u in inputs])
     n = len(e)
     if n <= 2 * RESIDUAL_LAGS:
         return {}
     figures = {}
     for i, name in enumerate(names):
-        own = _correlations(e[:, i], e[:, i])
+        read = np.isfinite(e[:, i])
+        # Errors of 0 where nothing is read leave the band of the correlations with the inputs as it is.
+        of = e[:, i] if read.all() else np.where(read, e[:, i], 0.0)
+        own = _correlations(of, of)
+        apart = own if read.all() else _correlations(e[read, i], e[read, i])
         bound = 2.58 / np.sqrt(n)
         cross = []
         for u in v.T:
             # Correlated inputs widen the band: the product of both autocorrelations, after Bartlett.
             wide = np.sqrt(max(1 + 2 * float(np.sum(own[1:] * _correlations(u, u)[1:])), 1.0))
-            cross.append(np.abs(_correlations(e[:, i], u)) > bound * wide)
+            cross.append(np.abs(_correlations(of, u)) > bound * wide)
         figures[name] = {
-            "autocorrelated": float(np.mean(np.abs(own[1:]) > bound)),
+            "autocorrelated": float(np.mean(np.abs(apart[1:]) > 2.58 / np.sqrt(np.count_nonzero(read)))),
             "input_correlated": float(np.mean(cross)),
         }
     return figures

@@ -58,11 +58,15 @@ class Scales:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScaledRecord:
-    """Scaled rows: outputs y (N, n_y), inputs v (N, n_v), and the run (N,) that each row belongs to."""
+    """Scaled rows: outputs y (N, n_y) and inputs v (N, n_v), and the run (N,) that each row belongs to.
+
+    ``fresh`` (N, n_y) says which outputs are new readings; None: all are.
+    """
 
     y: Array
     v: Array
     run: NDArray[np.int64]
+    fresh: NDArray[np.bool_] | None = None
 
     @classmethod
     def of(cls, record: Record, scales: Scales) -> Self:
@@ -70,10 +74,20 @@ class ScaledRecord:
         n_y = len(scales.y_scale)
         y, v = record.pv[:, :n_y], np.hstack([record.mv, record.dv])
         check_finite("the rows to identify from", y, v)
-        return cls((y - scales.y_center) / scales.y_scale, (v - scales.v_center) / scales.v_scale, record.run)
+        fresh = None if record.fresh is None or record.fresh[:, :n_y].all() else record.fresh[:, :n_y]
+        return cls((y - scales.y_center) / scales.y_scale, (v - scales.v_center) / scales.v_scale, record.run, fresh)
 
     def __len__(self) -> int:
         return len(self.y)
+
+    @property
+    def readings(self) -> int:
+        """Number of new readings of all outputs."""
+        return self.y.size if self.fresh is None else int(np.count_nonzero(self.fresh))
+
+    def read(self, i: int) -> NDArray[np.bool_] | None:
+        """The rows (N,) with a new reading of output i; None: all."""
+        return None if self.fresh is None or self.fresh[:, i].all() else self.fresh[:, i]
 
     def delayed(self, delays: Sequence[int]) -> Self:
         """The same rows with input j of ``delays[j]`` rows before, or after where that is negative.
@@ -97,11 +111,17 @@ class ScaledRecord:
 
     def rows(self, rows: slice) -> Self:
         """Some neighbouring rows."""
-        return replace(self, y=self.y[rows], v=self.v[rows], run=self.run[rows])
+        fresh = None if self.fresh is None else self.fresh[rows]
+        return replace(self, y=self.y[rows], v=self.v[rows], run=self.run[rows], fresh=fresh)
 
     def stretches(self) -> list[Stretch]:
         """The runs that are long enough; ModelError where none is."""
-        found = [Stretch(self.y[i:j], self.v[i:j]) for i, j in self.bounds() if j - i >= SHORTEST_STRETCH]
+        fresh = self.fresh
+        found = [
+            Stretch(self.y[i:j], self.v[i:j], None if fresh is None else fresh[i:j])
+            for i, j in self.bounds()
+            if j - i >= SHORTEST_STRETCH
+        ]
         if not found:
             longest = max(j - i for i, j in self.bounds())
             raise ModelError(
@@ -144,8 +164,7 @@ def informative(record: Record, most: int, block: int = 500) -> Record:
     best = np.sort(np.argsort(-blocks, kind="stable")[: most // block])
     rows = np.concatenate([np.arange(i * block, min((i + 1) * block, n)) for i in best])
     cut = np.r_[True, (np.diff(rows) > 1) | (np.diff(record.run[rows]) != 0)]
-    taken = {name: getattr(record, name)[rows] for name in ("time_s", "pv", "mv", "dv")}
-    return replace(record, run=np.cumsum(cut, dtype=np.int64) - 1, **taken)
+    return record.at(rows, np.cumsum(cut, dtype=np.int64) - 1)
 
 
 # ------------------------------------------------------- the row on whose outputs an MV acts: the next one, or its own

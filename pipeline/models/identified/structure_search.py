@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from loopwright.pipeline.errors import ModelError
+from loopwright.pipeline.historian.analyser_readings import Aligned, of_samples
 from loopwright.pipeline.historian.feedback import fed_back
 from loopwright.pipeline.historian.stated_answers import Beside, beside_record
 from loopwright.pipeline.models.identified.candidates import RESTING_SHARE, misses, rests_under
@@ -305,7 +306,8 @@ MINUTES = 2.0
 class Searched:
     """The problem that was searched, its outcome, the scales of its record, and what is known beside that record.
 
-    ``disturbances`` is of those that are measured.
+    ``disturbances`` is of those that are measured. ``late`` (n_y,) are the rows by which the readings of outputs come
+    late, and by which those of the problem stand earlier.
     """
 
     problem: Problem
@@ -313,6 +315,7 @@ class Searched:
     scales: Scales
     disturbances: Disturbances
     known: Sequence[Beside] = ()
+    late: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,7 +335,10 @@ class StructureSearch(Groundwork[Searched]):
         """The search over the source's record; ModelError where it cannot carry a model."""
         seen = source.data(self.kind)
         n_y, n_mv = len(source.signals.pv if self.all_measured else source.signals.sp), len(source.signals.mv)
-        back = seen.fed_back or fed_back(seen.mv, seen.pv[:, :n_y], seen.run)
+        quick = [i for i in range(n_y) if i not in seen.seldom]  # a look at an analyser now and then is no feedback
+        back = seen.fed_back or fed_back(seen.mv, seen.pv[:, quick], seen.run)
+        aligned = Aligned.of(seen, n_y)
+        seen = aligned.record
         record = informative(seen, self.rows)
         scales = Scales.of(record, n_y)
         data = ScaledRecord.of(record, scales)
@@ -342,7 +348,8 @@ class StructureSearch(Groundwork[Searched]):
         inputs, outputs = [s.name for s in (*signals.mv, *signals.dv)], [s.name for s in signals.pv[:n_y]]
         # No model is bent to what the record is certain to contradict: that is asked, and answered by a person.
         dv = data.v[:, n_mv:] * scales.v_scale[n_mv:] + scales.v_center[n_mv:]
-        beside = beside_record(source.known, replace(record, dv=dv) if disturbances.sure.any() else record)
+        stated = of_samples(source.known, dict(zip(outputs, aligned.late, strict=True)), signals.period_s)
+        beside = beside_record(stated, replace(record, dv=dv) if disturbances.sure.any() else record)
         used = [left for one in beside if (left := one.unopposed) is not None]
         known = Knowledge.of(used, outputs, inputs, scales, signals.period_s)
         problem = Problem(
@@ -354,7 +361,7 @@ class StructureSearch(Groundwork[Searched]):
         rounds = Rounds(problem, budget, label)
         selection = select(rounds, orders=orders, units=self.units, correction=self.correction, lagged=self.lagged)
         problem = replace(problem, settles=selection.settles, farthest=selection.farthest)
-        return Searched(problem, selection, scales, disturbances, beside)
+        return Searched(problem, selection, scales, disturbances, beside, aligned.late)
 
     def plainer(self, found: Searched) -> Searched | None:
         """The linear model in the network's place: it may be proven where the network bends by what is not the MVs'."""

@@ -141,13 +141,15 @@ def free_run_figures(
     low, high = trained.min(axis=0), trained.max(axis=0)
     figures = {}
     for i, name in enumerate(names):
-        y, error = actual[:, i], actual[:, i] - predicted[:, i]
+        read = np.isfinite(actual[:, i])
+        y, foreseen = actual[read, i], predicted[read, i]
+        error = y - foreseen
         edges = np.quantile(y, [1 / 3, 2 / 3])
         thirds = [error[np.searchsorted(edges, y) == j] for j in range(3)]
         figures[name] = {
             "free_run_rmse": float(np.sqrt(np.mean(error**2))),
             "held_sd": float(y.std()),
-            "fit_percent": fit_percent(y, predicted[:, i]) if np.all(np.isfinite(error)) else None,
+            "fit_percent": fit_percent(y, foreseen) if np.all(np.isfinite(error)) else None,
             "outside_training": float(np.mean((y < low[i]) | (y > high[i]))),
             "rmse_by_third": [float(np.sqrt(np.mean(e**2))) if len(e) else None for e in thirds],
         }
@@ -155,10 +157,13 @@ def free_run_figures(
 
 
 def _free(problem: Problem, model: Dynamics, held: Sequence[Stretch]) -> list[tuple[Array, Array]]:
-    """(measured, free run) (n, n_y) of each stretch."""
+    """(measured, NaN where nothing is read, free run) (n, n_y) of each stretch."""
     runs = zip(fit_starts(model, held, problem.judged), held, strict=True)
     found = [(s, model.free_run(x, s, problem.judged)) for x, s in runs]
-    return [(s.y, np.full(s.y.shape, np.nan) if r is None else r[0][:, : s.y.shape[1]]) for s, r in found]
+    return [
+        (s.errors(np.zeros_like(s.y)), np.full(s.y.shape, np.nan) if r is None else r[0][:, : s.y.shape[1]])
+        for s, r in found
+    ]
 
 
 def _ahead(model: Innovations, held: Sequence[Stretch]) -> list[tuple[Array, Array]]:
@@ -275,19 +280,21 @@ def response_figures(
     scales: Scales,
     pvs: Sequence[Signal],
     inputs: Sequence[Signal],
+    late: Sequence[int] = (),
 ) -> dict[str, Any]:
     """Step responses of each PV to a unit step of each input, from ``response_curves`` (members, n_v, length, n_y).
 
     A response holds ``periods``, and over the members the ``middle``, ``low`` and ``high`` in PV/input.
+    ``late`` (n_y,) are the periods by which the outputs come late.
     """
     size, length = STEP_SDS * data.v.std(axis=0), curves.shape[2]
-    every = max(length // RESPONSE_POINTS, 1)
+    every, of_output = max(length // RESPONSE_POINTS, 1), tuple(late) or (0,) * len(pvs)
     table: dict[str, Any] = {pv.name: {} for pv in pvs}
     for j, signal in enumerate(inputs):
         for i, pv in enumerate(pvs):
             found = curves[:, j, ::every, i] * scales.y_scale[i] / (scales.v_scale[j] * size[j])
             table[pv.name][signal.name] = {
-                "periods": [int(k) + 1 + int(delays[j]) for k in range(0, length, every)],
+                "periods": [int(k) + 1 + int(delays[j]) + of_output[i] for k in range(0, length, every)],
                 "middle": np.median(found, axis=0).tolist(),
                 "low": found.min(axis=0).tolist(),
                 "high": found.max(axis=0).tolist(),
@@ -296,16 +303,21 @@ def response_figures(
 
 
 def answer_figures(
-    model: Dynamics, delays: Sequence[int], data: ScaledRecord, pvs: Sequence[Signal], inputs: Sequence[Signal]
+    model: Dynamics,
+    delays: Sequence[int],
+    data: ScaledRecord,
+    pvs: Sequence[Signal],
+    inputs: Sequence[Signal],
+    lateness: Sequence[int] = (),
 ) -> dict[str, dict[str, Any]]:
     """``first_answers`` [periods] of each PV to each input, and ``dead_times`` [periods] of each input.
 
-        k_ij = delay_j + k_ij(model),   theta_j = min_i k_ij - 1
+        k_ij = delay_j + late_i + k_ij(model),   theta_j = min_i k_ij - 1
 
     They are the finished model's own, and ``dead`` of ``Identified`` holds the same dead times: the report, the
     manifests of the controllers and so their monitors read these. A first answer is None where nothing moves.
     """
-    answers = pair_answers(model, data)
+    answers = pair_answers(model, data) + np.asarray(lateness or (0,) * len(pvs))
     late = np.asarray(delays)
     first = [[int(k + late[j]) if k <= ANSWER_PERIODS else None for k in of] for j, of in enumerate(answers)]
     named = [signal.name for signal in inputs]

@@ -77,4 +77,5 @@ def error_ahead(problem: Problem, task: tuple[CandidateFits, int]) -> float:
             raise TypeError(type(model).__name__)
     pairs = [ahead(model, stretch) for stretch in held]
     errors = np.concatenate([measured - foreseen for measured, foreseen in pairs])
-    return typical(errors) if np.all(np.isfinite(errors)) else np.inf
+    known = np.concatenate([np.isfinite(measured) for measured, _ in pairs])
+    return typical(errors) if np.all(np.isfinite(errors[known])) else np.inf

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, Self
 
 import numpy as np
@@ -157,7 +157,7 @@ def split_in_time(record: Record, fraction: float) -> tuple[Record, Record]:
 
 def rows_of(record: Record, rows: slice) -> Record:
     """Some neighbouring rows of a record, with the runs and times that they had."""
-    return replace(record, **{name: getattr(record, name)[rows] for name in ("run", "time_s", "pv", "mv", "dv")})
+    return record.at(rows)
 
 
 def longest_run(record: Record, most: int) -> Record:

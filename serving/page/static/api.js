@@ -13,7 +13,7 @@ export async function get(path) {
 export class Refused extends Error {
   constructor(message, status, found = {}) {
     super(message);
-    Object.assign(this, { status, needs: found.needs, unproven: found.unproven });
+    Object.assign(this, { status, needs: found.needs, unproven: found.unproven, entry: found.entry });
   }
 }
 
@@ -33,6 +33,19 @@ export async function change(wanted, token) {
   }
   if (!answer.ok || found.error) throw new Refused(found.error || answer.statusText, answer.status, found);
   return found.done;
+}
+
+// What the law would do after changes by name; it changes nothing, so it needs no token.
+export async function foresee(changes) {
+  const answer = await fetch("/api/what-if", {
+    method: "POST",
+    headers: { "Content-Type": "application/json" },
+    body: JSON.stringify({ changes }),
+    signal: AbortSignal.timeout(PATIENCE_MS),
+  });
+  const found = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new Refused(found.error || answer.statusText, answer.status, found);
+  return found;
 }
 
 // Server-sent events. The browser connects again by itself, but not after an answer that is no stream (a proxy's 502).

@@ -1,6 +1,8 @@
 // Trends, one chart a signal, with one cursor and one time axis for all.
 import { ABOVE, bands } from "./bands.js";
+import * as foresight from "./foresight.js";
 import { clock, element, number, unit } from "./format.js";
+import * as ranges from "./ranges.js";
 
 const HEIGHT = 184;
 const SMALL = 134;
@@ -20,6 +22,7 @@ export function plan(about) {
   for (const s of mv)
     charts.push({
       name: s.name,
+      group: "mv",
       signal: s,
       tall: true,
       lines: [
@@ -143,7 +146,8 @@ export class Charts {
         ...chart.lines.map((l) => ({ label: l.label, spanGaps: false, points: { show: false }, value, ...looks[l.kind] })),
       ],
       hooks: {
-        drawClear: [(u) => bands(u, this.data, color)],
+        drawClear: [(u) => bands(u, this.data, color), (u) => ranges.draw(u, chart.signal, color)],
+        draw: [(u) => foresight.draw(u, chart.signal, chart.group === "mv" ? "mv" : "pv", color)],
         setSelect: [(u) => this.selected(u)],
         setCursor: [(u) => (u.cursor.left < 0 ? newest(u) : u.root.classList.add("reading"))],
         ready: [(u) => this.listen(u.over)],
@@ -162,6 +166,7 @@ export class Charts {
   range(signal, low, high) {
     const known = signal.high !== undefined;
     if (low === null || high === null || (this.whole && known)) return known ? [signal.low, signal.high] : [0, 1];
+    if (known) [low, high] = foresight.near(signal, ...ranges.near(signal, low, high));
     const least = known ? 0.01 * (signal.high - signal.low) : 1e-9 + 1e-6 * Math.max(Math.abs(low), Math.abs(high));
     const air = Math.max(0.08 * (high - low), (least - (high - low)) / 2, least / 2);
     return [low - air, high + air];

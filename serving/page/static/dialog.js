@@ -4,13 +4,16 @@ import { element, say } from "./format.js";
 
 const $ = (id) => document.getElementById(id);
 const UNAUTHORIZED = 401;
+const SETTLE_MS = 400; // after the last key
+let looking = 0; // the timer of a look at what would be
 let pending = null; // what is asked for now; an answer to an earlier one does not touch this one
 
 // title, words: what will change; fields: [{name, label, value, now, unit, min, max, choices}]; request(values): what is
-// sent. A field with `now` is sent only where the operator changed it, so that rounding moves nothing.
-export function ask({ title, words, fields = [], request }) {
+// sent. A field with `now` is sent only where the operator changed it, so that rounding moves nothing. foresee(values):
+// an element that shows what the values would do, or null.
+export function ask({ title, words, fields = [], request, foresee = null }) {
   const opener = document.activeElement;
-  pending = { fields, request, touched: new Set(), opener, place: opener?.closest("section") };
+  pending = { fields, request, foresee, touched: new Set(), opener, place: opener?.closest("section") };
   $("dialog-title").textContent = title;
   $("dialog-words").textContent = words;
   $("dialog-fields").replaceChildren(...fields.map(field));
@@ -21,6 +24,7 @@ export function ask({ title, words, fields = [], request }) {
   $("confirm").disabled = false;
   accepts(false);
   moves();
+  $("dialog-foreseen").replaceChildren();
   $("dialog").showModal();
   const first = $("dialog").querySelector("#dialog-fields input, #dialog-fields select");
   (first || ($("who").value ? $("why") : $("who"))).focus();
@@ -31,7 +35,7 @@ function field({ name, label, value, min, max, choices, step }) {
     ? element("select", { "data-field": name }, ...choices.map(([c, words]) => element("option", { value: c, selected: c === value }, words)))
     : element("input", { "data-field": name, type: "number", step: step || "any", required: true, min, max, value });
   given.dataset.first = given.value;
-  return element("label", {}, label + " ", given);
+  return element("label", {}, label + " ", given, element("span", { class: "wrong", id: `wrong-${name}` }));
 }
 
 // A controller that is not proven gets into AUTO by a second word only, which is written down.
@@ -59,15 +63,39 @@ function moves() {
   say($("dialog-moves"), said.join(", "));
 }
 
+// What the values would do, once the operator has stopped typing for a moment.
+function look() {
+  clearTimeout(looking);
+  if (!pending.foresee) return;
+  const mine = pending;
+  looking = setTimeout(async () => {
+    const values = wantedValues();
+    let shown = [];
+    wrong(null);
+    try {
+      const asked = Object.keys(values).length ? mine.foresee(values) : null;
+      if (asked) $("dialog-foreseen").replaceChildren(element("p", { class: "hint" }, "The law is asked what it would do…"));
+      shown = [await asked].filter(Boolean);
+    } catch (error) {
+      if (mine !== pending) return;
+      if (!wrong(error.entry, error.message, false)) shown = [error.message];
+    }
+    if (mine === pending) $("dialog-foreseen").replaceChildren(...shown);
+  }, SETTLE_MS);
+}
+
+const wantedValues = () => Object.fromEntries(wanted().map(([given, input]) => [given.name, Number(input.value)]));
+
 async function confirm(event) {
   event.preventDefault();
   const mine = pending;
   const sent = wanted();
   if (mine.fields.length && !sent.length) return say($("refusal"), "No value is changed yet.");
-  const values = Object.fromEntries(sent.map(([given, input]) => [given.name, Number(input.value)]));
+  const values = wantedValues();
   const [who, reason, token] = ["who", "why", "token"].map((id) => $(id).value.trim());
   sessionStorage.setItem("who", who);
   $("refusal").textContent = "";
+  wrong(null);
   $("confirm").disabled = true;
   let said, refused;
   try {
@@ -85,12 +113,31 @@ async function confirm(event) {
     accepts(unproven);
     $("refusal").textContent = unproven
       ? `Not done: not proven in closed loop. ${refused.unproven}. Accept it, and it moves the plant in AUTO all the same; that is written down.`
-      : said;
+      : wrong(refused.entry, refused.message)
+        ? `Not done: see ${refused.entry}.`
+        : said;
     if (refused.status === UNAUTHORIZED) $("token").select();
     return;
   }
   $("answer").textContent = said; // the dialog may have been left meanwhile; the answer is still told
   if (open) $("dialog").close();
+}
+
+// The loop's own words beside the entry that it refused; false where no field is of that name.
+function wrong(name, words, focus = true) {
+  let shown = false;
+  for (const input of inputs()) {
+    const mine = name && input.dataset.field === name;
+    const line = input.parentElement.querySelector(".wrong");
+    line.textContent = mine ? words : "";
+    for (const [attribute, value] of [["aria-invalid", "true"], ["aria-describedby", line.id]]) {
+      if (mine) input.setAttribute(attribute, value);
+      else input.removeAttribute(attribute);
+    }
+    if (mine && focus) input.focus();
+    shown ||= Boolean(mine);
+  }
+  return shown;
 }
 
 // The button that opened the dialog may be gone: then a keyboard goes on in its section, not at the page's top.
@@ -105,6 +152,7 @@ $("form").addEventListener("submit", confirm);
 $("dialog-fields").addEventListener("input", (event) => {
   pending.touched.add(event.target.dataset.field);
   moves();
+  look();
 });
 $("cancel").addEventListener("click", () => $("dialog").close());
 $("dialog").addEventListener("close", closed);

@@ -1,6 +1,7 @@
 // Mode, values, and what an operator may change.
 import { ask } from "./dialog.js";
 import { element, number, say, unit } from "./format.js";
+import * as operate from "./operate.js";
 
 const $ = (id) => document.getElementById(id);
 const MODES = {
@@ -15,6 +16,7 @@ let laid = ""; // what the values that stand on the page were laid out for
 
 export function describe(found) {
   about = found;
+  operate.describe(about);
   laid = "";
   if ($("modes").children.length) return;
   $("modes").replaceChildren(
@@ -48,7 +50,9 @@ function values() {
   const writes = Boolean(state.mv);
   const blocks = [
     ...pv.map((s, i) => [
+      "pv",
       s,
+      i,
       [...(i < sp.length ? [["SP", at(state.sp, i), "", ""]] : []), ["PV", at(state.pv, i), quality[i], ""]],
       [at(state.pv, i), i < sp.length ? at(state.sp, i) : null],
     ]),
@@ -59,24 +63,57 @@ function values() {
         ["MV applied", applied, quality[pv.length + i], ""],
       ];
       if (state.beside) cells.push(["Successor's MV", at(state.beside, i), "", "not written"]);
-      return [s, cells, [applied, wanted]];
+      return ["mv", s, i, cells, [applied, wanted]];
     }),
-    ...dv.map((s, i) => [s, [["DV", at(state.dv, i), quality[pv.length + mv.length + i], ""]], [at(state.dv, i), null]]),
+    ...dv.map((s, i) => ["dv", s, i, [["DV", at(state.dv, i), quality[pv.length + mv.length + i], ""]], [at(state.dv, i), null]]),
   ];
-  const layout = JSON.stringify(blocks.map(([s, cells]) => [s.name, cells.map(([kind]) => kind)]));
-  if (layout !== laid) $("values").replaceChildren(...blocks.map(([s, cells]) => block(s, cells)));
+  const layout = JSON.stringify([about.title, blocks.map(([, s, , cells]) => [s.name, cells.map(([kind]) => kind)])]);
+  if (layout !== laid) {
+    const whole = operate.part("law", null, state);
+    $("values").replaceChildren(...blocks.map(([group, s, , cells]) => block(group, s, cells)), ...(whole ? [lawBlock(whole)] : []));
+  }
   laid = layout;
-  blocks.forEach(([s, cells, marks], i) => fill($("values").children[i], s, cells, marks));
+  blocks.forEach(([group, s, i, cells, marks], at) => {
+    const made = $("values").children[at];
+    fill(made, s, cells, marks);
+    const operated = made.querySelector(".operated");
+    if (!operated) return;
+    operate.fill(operated, group, s, state, i);
+    within(made.querySelector(".within"), s, operate.range(s));
+  });
+  const whole = $("values").querySelector('[data-operated="law"]');
+  if (whole) operate.fill(whole, "law", null, state, 0);
 }
+
+const lawBlock = (part) => element("div", { class: "signal", role: "group", "aria-label": "The whole law" }, headed("The whole law", "law", null), part);
+
+// The name of a block, and the button that changes what operators may change of it.
+function headed(name, group, signal) {
+  const button = element("button", { type: "button", "data-change": signal ? name : "law", "aria-label": `Change ${name}…`, onclick: () => operate.askChange(group, signal) }, "Change…");
+  return element("div", { class: "headed" }, element("h3", {}, name), button);
+}
+
+// The part of the bar that operators allow.
+function within(box, signal, ends) {
+  box.hidden = !ends;
+  if (!ends) return;
+  const [from, to] = ends.map((v) => share(v, signal));
+  box.style.left = `${from}%`;
+  box.style.width = `${to - from}%`;
+}
+
+const share = (v, signal) => Math.min(100, Math.max(0, (100 * (v - signal.low)) / (signal.high - signal.low)));
 
 const at = (values, i) => (values ? values[i] : null);
 
 // Where an MV can go no further.
 const end = (value, { low, high, values }) => (value === null || values ? "" : value >= high ? "at its upper end" : value <= low ? "at its lower end" : "");
 
-function block(signal, cells) {
+function block(group, signal, cells) {
   const range = `${number(signal.low, signal)} … ${number(signal.high, signal)} ${unit(signal)}`.trim();
-  const bar = element("div", { class: "bar", title: range, "aria-hidden": "true" }, element("div", { class: "fill" }), element("div", { class: "mark" }));
+  const operated = operate.part(group, signal, state);
+  const inside = operated && element("div", { class: "within", hidden: true });
+  const bar = element("div", { class: "bar", title: range, "aria-hidden": "true" }, inside, element("div", { class: "fill" }), element("div", { class: "mark" }));
   const made = cells.map(([kind]) =>
     element(
       "div",
@@ -86,7 +123,7 @@ function block(signal, cells) {
       element("span", { class: "quality" }),
     ),
   );
-  return element("div", { class: "signal", role: "group", "aria-label": signal.name }, element("h3", {}, signal.name), element("div", { class: "cells" }, ...made), bar);
+  return element("div", { class: "signal", role: "group", "aria-label": signal.name }, operated ? headed(signal.name, group, signal) : element("h3", {}, signal.name), element("div", { class: "cells" }, ...made), bar, operated);
 }
 
 function fill(block, signal, cells, [value, mark]) {
@@ -97,11 +134,15 @@ function fill(block, signal, cells, [value, mark]) {
     say(cell.querySelector(".number"), number(number_, signal));
     say(cell.querySelector(".quality"), bad ? `▲ ${quality}` : words);
   });
-  const share = (v) => Math.min(100, Math.max(0, (100 * (v - signal.low)) / (signal.high - signal.low)));
-  block.querySelector(".fill").style.width = `${value === null ? 0 : share(value)}%`;
+  block.querySelector(".fill").style.width = `${value === null ? 0 : share(value, signal)}%`;
   const line = block.querySelector(".mark");
   line.hidden = mark === null;
-  if (mark !== null) line.style.left = `${share(mark)}%`;
+  if (mark !== null) line.style.left = `${share(mark, signal)}%`;
+}
+
+// News of what the law predicts, between two states.
+export function foreseen() {
+  if (about && state?.pv !== undefined) values();
 }
 
 function askMode(mode) {
@@ -130,6 +171,7 @@ function askValues(title, words, signals, present, what) {
       max: s.high,
       choices: s.values && s.values.map((v) => [v, choice(v, s)]),
     })),
+    foresee: what === "sp" ? operate.foresee : null,
     request: (values) => ({ do: what, value: values }),
   });
 }

@@ -4,10 +4,13 @@ import * as card from "./card.js";
 import { Charts, plan } from "./charts.js";
 import { Data } from "./data.js";
 import * as faceplate from "./faceplate.js";
+import * as foresight from "./foresight.js";
 import { clock, duration, element, say, zone } from "./format.js";
 import * as log from "./log.js";
+import * as ranges from "./ranges.js";
 import { steer } from "./steering.js";
 import { View } from "./view.js";
+import * as weeks from "./weeks.js";
 
 const $ = (id) => document.getElementById(id);
 const SPANS = [["5 min", 300], ["1 h", 3600], ["8 h", 28800], ["1 d", 86400], ["7 d", 604800]];
@@ -27,7 +30,7 @@ let broken = false;
 let hidden = new Set(JSON.parse(localStorage.getItem("hidden") || "null") || []);
 
 const now = () => (state && state.time && !broken && state.alive ? Math.max(state.time, data.time.at(-1) || 0) : Date.now() / 1000);
-const view = new View(Number(localStorage.getItem("span")) || SPANS[0][1], now);
+const view = new View(Number(localStorage.getItem("span")) || SPANS[0][1], now, foresight.ahead);
 const zoomed = (from, to) => look(() => view.look(from, to));
 const live = () => look(() => view.follow());
 const charts = new Charts($("charts"), { zoomed, back: live });
@@ -44,16 +47,18 @@ function look(act) {
   const times = view.live ? `the last ${duration(view.span)}` : `${clock(from)} to ${clock(to)}`;
   say($("time-shown"), times);
   charts.forget();
-  charts.draw(from, to);
+  draw();
   clearTimeout(again);
   again = setTimeout(reload, SETTLE_MS);
 }
+
+const draw = () => charts.draw(...view.shown());
 
 async function reload() {
   clearTimeout(again);
   const [from, to] = view.bounds();
   try {
-    if (await data.load(from, to)) charts.draw(...view.bounds());
+    if (await data.load(from, to)) draw();
   } catch (error) {
     old(error.message);
     clearTimeout(again);
@@ -74,6 +79,8 @@ async function describeAll() {
   data.longest = (GAP * about.period_s) / (about.speed || 1);
   $("title").textContent = about.title;
   faceplate.describe(about);
+  foresight.describe(about);
+  ranges.describe(about);
   card.describe(about);
   choice();
   build();
@@ -97,7 +104,7 @@ function choice() {
         hidden[hidden.has(key) ? "delete" : "add"](key);
         localStorage.setItem("hidden", JSON.stringify([...hidden]));
         build();
-        charts.draw(...view.bounds());
+        draw();
       });
       return element("label", {}, box, ` ${chart.name}${chart.optional ? " (law)" : ""}`);
     }),
@@ -107,9 +114,18 @@ function choice() {
 function show(found) {
   state = found;
   data.mode(found.time, found.mode);
+  ranges.show(found);
   faceplate.show(found);
   card.show(found);
   fresh();
+  foreseen();
+}
+
+// What the law predicts is asked for with each state, and drawn once it is here.
+async function foreseen() {
+  if (!about || !(await foresight.refresh())) return;
+  faceplate.foreseen();
+  if (view.live) draw();
 }
 
 function onState(found) {
@@ -120,7 +136,7 @@ function onState(found) {
 function onScans(rows) {
   if (!view.live) return;
   const thin = data.append(rows, now() - 1.1 * view.span);
-  charts.draw(...view.bounds());
+  draw();
   if (thin) reload();
 }
 
@@ -167,7 +183,7 @@ function buttons() {
   $("scale").addEventListener("click", () => {
     charts.whole = !charts.whole;
     $("scale").setAttribute("aria-pressed", String(charts.whole));
-    charts.draw(...view.bounds());
+    draw();
   });
   for (const menu of [$("choice"), $("help")]) {
     menu.addEventListener("keydown", (event) => {
@@ -190,13 +206,14 @@ function theme(name, keep = true) {
   if (keep) localStorage.setItem("theme", name);
   if (about) {
     build();
-    charts.draw(...view.bounds());
+    draw();
   }
 }
 
 buttons();
 look(() => {});
 watch();
+weeks.watch();
 setInterval(watch, 1000);
 const lost = () => {
   broken = true;

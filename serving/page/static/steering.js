@@ -36,7 +36,7 @@ function fingers(box, view, changed) {
   const begin = (event) => {
     const over = event.target.closest(".u-over");
     const { left, width } = (over || box).getBoundingClientRect();
-    began = { first: [...down.values()], bounds: view.bounds(), left, width, moves: down.size > 1 };
+    began = { first: [...down.values()], bounds: view.bounds(), drawn: view.shown(), left, width, moves: down.size > 1 };
   };
   box.addEventListener("pointerdown", (event) => {
     if (event.pointerType !== "touch" || !event.target.closest(".u-over") || down.size > 1) return;
@@ -46,12 +46,12 @@ function fingers(box, view, changed) {
   box.addEventListener("pointermove", (event) => {
     if (!down.has(event.pointerId)) return;
     down.set(event.pointerId, event.clientX);
-    const { first, bounds, left, width } = began;
+    const { first, bounds, drawn, left, width } = began;
     const x = [...down.values()];
     began.moves ||= Math.abs(x[0] - first[0]) > LEAST_PX;
     if (!began.moves) return;
     const [from, to] = bounds;
-    const at = (px) => from + ((px - left) / width) * (to - from); // when that was, as the gesture began
+    const at = (px) => from + ((px - left) / width) * (drawn[1] - from); // when that was, as the gesture began
     if (x.length === 1) {
       const by = at(first[0]) - at(x[0]);
       if (to + by >= view.now()) view.follow(to - from);

@@ -6,14 +6,22 @@ const LONGEST = 400 * 86400; // what the server draws at once
 const STEP = 0.2; // of what is shown, by which a key or a button goes
 
 export class View {
-  constructor(span, now) {
+  // ahead(span): the seconds after now that are drawn while it is live.
+  constructor(span, now, ahead = () => 0) {
     this.span = span;
     this.now = now;
+    this.ahead = ahead;
     this.chosen = null; // [from, to]
   }
 
   get live() {
     return this.chosen === null;
+  }
+
+  // With the time ahead that is drawn beside the newest scans.
+  shown() {
+    const [from, to] = this.bounds();
+    return [from, this.live ? to + this.ahead(to - from) : to];
   }
 
   bounds() {

@@ -12,9 +12,9 @@
 
 /* Value references. variables.py counts them in the same way: VR_FIRST on, group after group. */
 enum { VR_TIME, VR_FAULT, VR_USE_APPLIED, VR_FIRST };
-enum { G_SP, G_PV, G_DV, G_APPLIED, G_START, G_MV, G_INFO, G_OPERATE, G_FRESH, G_USE_FRESH, GROUPS };
+enum { G_SP, G_PV, G_DV, G_APPLIED, G_START, G_MV, G_INFO, G_OPERATE, G_FRESH, G_USE_FRESH, G_AHEAD, GROUPS };
 static const char *const GROUP[GROUPS] = {"sp", "pv", "dv", "mv_applied", "mv_start", "mv", "info", "operate", "fresh",
-                                          "use_fresh"};
+                                          "use_fresh", "ahead"};
 
 /* The memory of an instance is one block of doubles, so that it is saved and restored at once: these entries, the
    variables, the law's state. */
@@ -91,7 +91,7 @@ static bool instance_open(Instance *i, const char *token, const char *resources)
     return REFUSE(i, "the path of the FMU's resources is missing or too long");
   if (!open_in_c_locale(&i->c, path)) return REFUSE(i, "%s", i->c.words);
   if (!is_token_of(&i->c, token)) return REFUSE(i, "the FMU's token %s is not of its controller", token ? token : "");
-  static const int OF[GROUPS] = {SP, PV, DV, MV, [G_OPERATE] = OPERATE, [G_FRESH] = FRESH, [G_USE_FRESH] = FRESH};
+  static const int OF[GROUPS] = {SP, PV, DV, MV, [G_OPERATE] = OPERATE, [G_FRESH] = FRESH, [G_USE_FRESH] = FRESH, [G_AHEAD] = AHEAD};
   size_t end = OWN;
   for (int g = 0; g < GROUPS; g++) {
     if (g == G_START || g == G_MV) i->n[g] = i->c.n_in[MV];
@@ -213,6 +213,7 @@ static void sample(Instance *i, double at_s) {
                                       m + i->at[connected ? G_APPLIED : G_MV]};
   bool told = i->n[G_FRESH] && m[i->at[G_USE_FRESH]] != 0;
   for (size_t k = 0; k < i->n[G_FRESH]; k++) i->c.fresh[k] = told ? m[i->at[G_FRESH] + k] : 1;
+  memcpy(i->c.ahead, m + i->at[G_AHEAD], i->n[G_AHEAD] * sizeof *m);
   m[FAULT] = controller_step(&i->c, given) != STEPPED;
   if (m[FAULT] != 0) {
     speak(i, LOG_WARNING, "the sample at %.15g s is refused and the MV held: %s", at_s, i->c.words);

@@ -1,0 +1,83 @@
+"""Courses in a CSV file: a column of times, and one of values for each signal."""
+
+from __future__ import annotations
+
+import csv
+from datetime import UTC, datetime
+from math import isfinite
+from pathlib import Path
+
+from loopwright.serving.errors import LoopError
+from loopwright.serving.fields import shown
+
+TIME_COLUMNS = ("time", "time_s")
+LARGEST_FILE = 20_000_000  # bytes: far above the points that a course may have
+
+
+def read_courses(path: Path, now_s: float) -> dict[str, list[tuple[float, float]]]:
+    """Points (time [s] from now, value) of each signal of a file.
+
+    The first line names the columns: ``time``, then signals. A time is a number of seconds from now, or a date and time
+    as 2026-03-01T14:30, in UTC unless it says otherwise; ``now_s`` is the present one in seconds since 1970. An empty
+    cell is no point of its signal.
+
+    LoopError for a file that cannot be read, and with the line for a cell that is wrong.
+    """
+    try:
+        if path.stat().st_size > LARGEST_FILE:
+            raise LoopError(f"{path} has {path.stat().st_size} bytes; a course may have {LARGEST_FILE}")
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except OSError as error:
+        raise LoopError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise LoopError(f"{path} is no CSV file: {error}") from error
+    names = [name.strip() for name in rows[0]] if rows else []
+    if len(names) < 2 or names[0] not in TIME_COLUMNS:
+        raise LoopError(
+            f"{path}: the first line is {shown(','.join(names))}; it needs time and names of signals, as time,TIC-1"
+        )
+    if "" in names or len(set(names)) < len(names):
+        raise LoopError(f"{path}: the first line has a name twice, or an empty one: {', '.join(names)}")
+    points: dict[str, list[tuple[float, float]]] = {name: [] for name in names[1:]}
+    for number, row in enumerate(rows[1:], start=2):
+        cells = [cell.strip() for cell in row]
+        if not any(cells):
+            continue
+        where = f"{path}, line {number}"
+        if len(cells) != len(names):
+            raise LoopError(f"{where} has {len(cells)} cells; the first line has {len(names)}")
+        time_s = _time(cells[0], now_s, where)
+        for name, cell in zip(names[1:], cells[1:], strict=True):
+            if cell:
+                points[name].append((time_s, _number(cell, f"{where}: {name}")))
+    empty = [name for name, of in points.items() if not of]
+    if empty:
+        raise LoopError(f"{path} has no value of {', '.join(empty)}; leave the column out, or fill it")
+    return points
+
+
+def _time(cell: str, now_s: float, where: str) -> float:
+    """Seconds from now of a cell that is a number of seconds, or a date and time."""
+    try:
+        seconds = float(cell)
+        if isfinite(seconds):
+            return seconds
+    except ValueError:
+        pass
+    try:
+        stamp = datetime.fromisoformat(cell)
+    except ValueError:
+        raise LoopError(
+            f"{where}: the time is {shown(cell)}; it needs seconds from now, or as 2026-03-01T14:30"
+        ) from None
+    return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp() - now_s
+
+
+def _number(cell: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        raise LoopError(f"{where} is {shown(cell)}; it needs a number, or an empty cell for no point") from None
+    if not isfinite(value):
+        raise LoopError(f"{where} is {shown(cell)}; it must be finite")
+    return value

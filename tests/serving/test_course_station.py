@@ -1,0 +1,200 @@
+"""A station takes courses: by requests and by the command, in its journal and its views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fake_loop import FakeLoop
+
+from loopwright.pipeline.__main__ import main
+from loopwright.serving import Controller, LoopError, Sample, VirtualClock
+from loopwright.serving.journal import JournalReader
+from loopwright.serving.loop import Command
+from loopwright.serving.opcua.sampling import Values
+from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.station import station
+from loopwright.serving.station.build_loop import control_loop
+from loopwright.serving.station.mv_lock import Lease
+from loopwright.serving.station.requests import Request, change
+from loopwright.serving.station.settings import JournalSettings, Settings
+from loopwright.serving.station.station import Station
+from loopwright.serving.station.views import about, state
+
+pytest_plugins = ["small_laws", "operated_files", "course_files"]
+SERVER = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
+COURSE = {"points": {"y0": [[2, 0.5]], "d0": [[0, 0.0], [3, 0.2]], "y1": [[50, 1.0]]}}
+
+
+def settings_of(controller: Controller, **changed: Any) -> Settings:
+    m = controller.manifest
+    nodes = {g: {s.name: f"ns=2;s={s.name}" for s in m.signals(g)} for g in ("pv", "dv", "mv")}
+    return Settings(controller.path, SERVER, Nodes(**nodes), start="MANUAL", **changed)
+
+
+class StillPlant:
+    """In the place of the endpoint: it stands still and reads back what was written."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        self.trouble, self.connections, self.connected = "", 1, True
+        self.mv, self.asked_sp = np.zeros(2), dict[str, float]()
+
+    @property
+    def values(self) -> Values:
+        return Values(0.0, np.zeros(2), self.mv, np.zeros(1), 0.0, "", (), asked_sp=self.asked_sp)
+
+    def start(self) -> None:
+        """Nothing: it is there."""
+
+    def serve(self, law: Any) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+    def read(self) -> Sample:
+        return Sample(np.zeros(2), self.mv, dv=np.zeros(1))
+
+    def write(self, mv: np.ndarray) -> None:
+        self.mv = mv.copy()
+
+
+@pytest.fixture
+def made(previewing: Controller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Station:
+    monkeypatch.setattr(station, "OpcUaEndpoint", StillPlant)
+    monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
+    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
+    settings = settings_of(previewing, journal=JournalSettings(tmp_path / "loop.journal"))
+    return Station(settings, controller=Controller(previewing.path))  # type: ignore[arg-type]
+
+
+def ran(made: Station, scans: int, **at: Callable[[], None]) -> tuple[list[Command], list[str]]:
+    """The commands and events of a run in which something happens after the scans ``s0``, ``s1``, ..."""
+    commands: list[Command] = []
+
+    def seen(_: Sample | None, command: Command) -> None:
+        commands.append(command)
+        if act := at.get(f"s{len(commands) - 1}"):
+            act()
+
+    made.watch(seen)
+    made.run(scans)
+    with closing(JournalReader(made.settings.journal.file)) as reader:
+        return commands, [f"{e.kind} {e.who}: {e.what} ({e.reason})" for _, e in reader.events()]
+
+
+def asked(made: Station, do: str, value: Any) -> Callable[[], None]:
+    def act() -> None:
+        assert made.loop is not None
+        request = Request.read({"do": do, "value": value, "who": "anna", "reason": "batch 7"})
+        made.ask(change(request, made.loop, lambda file, sha256: Controller(file)))
+
+    return act
+
+
+def test_a_course_is_followed_written_down_and_shown(made: Station) -> None:
+    commands, events = ran(made, 8, s0=asked(made, "course", COURSE))
+    assert [c.sp[0] for c in commands] == [0, 0, 0, 0.5, 0.5, 0.5, 0.5, 0.5]
+    given = [line for line in events if line.startswith("change anna: course of ")]
+    assert len(given) == 1
+    assert all(word in given[0] for word in ("y0 1 points", "d0 2 points", "0.5 m at 2 s", "batch 7"))
+    assert [line for line in events if "is over" in line] == [
+        "change loop: the course of y0 is over ()",
+        "change loop: the course of d0 is over ()",
+    ]
+    shown = state(made)["courses"]
+    assert shown == {"y1": {"ends_in_s": 43.0, "at": 1.0}}
+    assert about(made)["ahead"]["horizon"] == 12
+
+
+def test_an_operators_set_point_ends_it_and_that_is_told(made: Station) -> None:
+    commands, events = ran(
+        made, 8, s0=asked(made, "course", COURSE), s1=asked(made, "sp", {"y0": 0.0}), s3=asked(made, "sp", {"y1": 0.2})
+    )
+    assert [c.sp[0] for c in commands] == [0] * 8  # also where it is set to what it is
+    assert commands[-1].sp[1] == 0.2
+    assert sum("the course of y0 ends" in line for line in events) == 1
+    assert sum("the course of y1 ends" in line for line in events) == 1
+    assert state(made)["courses"] == {}
+
+
+def test_a_set_point_by_a_node_ends_it_and_that_is_told(made: Station) -> None:
+    def by_node() -> None:
+        made.endpoint.asked_sp = {"y1": 0.3}  # type: ignore[attr-defined]
+
+    commands, events = ran(made, 6, s0=asked(made, "course", COURSE), s2=by_node)
+    assert commands[-1].sp[1] == 0.3
+    assert any(line.startswith("change plant: set point y1 0.3 m (the course of y1 ends") for line in events)
+
+
+@pytest.mark.parametrize("value", [None, {"end": ["y0", "y1", "d0"]}])
+def test_courses_are_ended_by_a_request(made: Station, value: Any) -> None:
+    commands, events = ran(made, 6, s0=asked(made, "course", COURSE), s1=asked(made, "course", value))
+    assert [c.sp[0] for c in commands] == [0] * 6
+    assert sum("ends (batch 7)" in line for line in events) == 1
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        {},
+        5,
+        [],
+        {"end": ["y0"]},
+        {"end": "y0"},
+        {"points": {"y0": [[0, 9.0]]}},
+        {"points": {"y0": 5}},
+        {"points": None},
+        {"points": {"y0": [[0, 0.5]]}, "straight": "y0"},
+        {"points": {"y0": [[0, 0.5]]}, "straight": ["y1"]},
+        {"points": {"y0": [[0, 0.5]]}, "more": 1},
+    ],
+    ids=str,
+)
+def test_a_request_that_cannot_be_is_one_clear_error(previewing: Controller, value: Any) -> None:
+    loop = control_loop(settings_of(previewing), previewing, mv=[0.0, 0.0])
+    with pytest.raises(LoopError) as error:
+        change(Request.read({"do": "course", "value": value, "who": "anna"}), loop, lambda f, s: Controller(f))
+    assert "\n" not in str(error.value)
+
+
+def test_a_law_that_does_not_read_it_is_one_clear_error(operated: Controller) -> None:
+    loop = control_loop(settings_of(operated), operated, mv=[40.0, 0.5])
+    value = {"points": {"T": [[0, 300.0]]}}
+    with pytest.raises(LoopError, match="has no ahead"):
+        change(Request.read({"do": "course", "value": value, "who": "anna"}), loop, lambda f, s: Controller(f))
+
+
+def test_the_command_sends_a_file(
+    previewing: Controller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = FakeLoop(tmp_path, previewing)
+    toml = Path("loop.toml")
+    toml.write_text(
+        f'controller = "{previewing.path}"\n[server]\nendpoint = "opc.tcp://127.0.0.1:1"\nsecurity = "None"\n'
+        f'insecure = true\n[nodes.pv]\n[nodes.mv]\n[journal]\nfile = "{made.journal.name}"\n'
+    )
+    Path("recipe.csv").write_text("time,y0,d0\n0,,0\n600,0.5,0.2\n")
+    Path("wrong.csv").write_text("time,y0\nsoon,0.5\n")
+    try:
+        words = ["loop", "course", "recipe.csv", "--straight", "y0", "--who", "anna"]
+        assert main(words) == 0
+        assert made.changes[-1]["do"] == "course"
+        assert made.changes[-1]["value"] == {
+            "points": {"y0": [[600.0, 0.5]], "d0": [[0.0, 0.0], [600.0, 0.2]]}, "straight": ["y0"],
+        }  # fmt: skip
+        assert main(["loop", "course", "--end", "y0"]) == 0
+        assert made.changes[-1]["value"] == {"end": ["y0"]}
+        assert main(["loop", "course", "--end"]) == 0
+        assert made.changes[-1]["value"] is None
+        capsys.readouterr()
+        assert main(["loop", "course", "wrong.csv"]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    finally:
+        made.close()
