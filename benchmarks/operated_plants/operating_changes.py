@@ -158,7 +158,7 @@ def _allowed(operate: Operate, values: Mapping[str, float]) -> bool:
 def operating_rows(plant: OperatedPlant, fit: Fit) -> str:
     """The figures of one plant in words."""
     model, _ = fit.model(plant)
-    law = law_of(plant, model)
+    law = law_of(plant, model, tuning="given")  # by which the converged one is made, too
     controller = controller_of(plant, law)
     parts = [plant.name]
     if plant.name in AT_ODDS:
