@@ -5,7 +5,7 @@ in the folder for temporary files), then three rows of figures over the days of 
 of which the first 40 are not scored:
 
 - ours: the model is identified from one record of 8,000 rows with noise, and with all that wanders unmeasured. The
-  law has all defaults beside what operators set (``operate`` of the plant). The runtime steps its file. An
+  law has what operators set (``operate`` of the plant), and ``tuning: search``. The runtime steps its file. An
   analyser's model comes from a record in which it reads at every row, late; on the day it reads seldom.
 - PID: schemes as engineers build them, tuned on the true plant on days that are not scored (``pid_blocks.py``).
 - NMPC: the true equations, the same measurements through a Kalman filter, the law's cost (``perfect_economic.py``).

@@ -42,6 +42,9 @@ def tuned_settings(plant: OperatedPlant, samples: int = TUNING_DAY, days: Sequen
     known = [
         plant.name,
         plant.title,
+        BEYOND,
+        TRAVEL,
+        COST,
         REST,
         samples,
         list(days),
@@ -92,7 +95,8 @@ def contested(
     began = time.process_time()
     settings = tuned_settings(plant)
     seconds["tuning"] = time.process_time() - began
-    perfect = PerfectEconomic(plant, law, model)
+    # Numbers that are given, so that a search of ours does not move the bound.
+    perfect = PerfectEconomic(plant, law_of(plant, model, tuning="given"), model)
     days = [plant.day(seed, samples) for seed in seeds]
     ways: dict[str, Callable[[], DayController]] = {
         "ours": lambda: Served(controller),

@@ -37,7 +37,9 @@ def drawn(contest: Contest, day: Day, path: Path) -> None:
     for column, signals in enumerate((plant.pv, plant.mv)):
         for i in range(len(signals), n):
             axes[i, column].set_visible(False)
-        axes[len(signals) - 1, column].set_xlabel("time [h]")
+        last = axes[len(signals) - 1, column]
+        last.set_xlabel("time [h]")
+        last.tick_params(labelbottom=True)
     axes[0, 0].legend(loc="upper right", ncols=4, fontsize="small", frameon=False)
     axes[0, 0].set_title(plant.title, loc="left", fontsize="medium")
     figure.savefig(path)

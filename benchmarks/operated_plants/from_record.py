@@ -6,8 +6,9 @@ import hashlib
 import pickle
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from operated_plant import OperatedPlant
@@ -90,13 +91,14 @@ class Fit:
 
 
 def params_of(plant: OperatedPlant) -> PredictiveParams:
-    """All defaults but what operators have set."""
-    return PredictiveParams(operate=plant.operate)
+    """As ``new`` writes them, with what operators have set: the law's numbers are searched on the model."""
+    return PredictiveParams(operate=plant.operate, tuning="search")
 
 
-def law_of(plant: OperatedPlant, model: Identified) -> Predictive:
+def law_of(plant: OperatedPlant, model: Identified, tuning: Literal["given", "search"] = "search") -> Predictive:
     """The law with these parameters."""
-    return Predictive.design(params_of(plant), {"identified": model}, plant.signals, None).eval()
+    params = replace(params_of(plant), tuning=tuning)
+    return Predictive.design(params, {"identified": model}, plant.signals, None).eval()
 
 
 def controller_of(plant: OperatedPlant, law: Predictive) -> Controller:

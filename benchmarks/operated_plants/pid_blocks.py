@@ -1,4 +1,4 @@
-"""Blocks of which engineers build control schemes: PI with tracking, selectors, feed-forward, and their tuning.
+"""Blocks of which engineers build control schemes: PI with tracking, selectors, feedforward, and their tuning.
 
 The rule of tuning: gains and reset times start where the plant's file has them, from its lags; then each number in
 turn is multiplied and divided by a factor that shrinks (1.6, 1.25, 1.1) as long as the cost of two days falls, whose
@@ -61,7 +61,7 @@ def searched(start: Array, cost: Callable[[Array], float]) -> Array:
                         tried = best.copy()
                         tried[i] *= by
                         found = cost(tried)
-                        if not found < least * (1 - 1e-3):
+                        if not found < least - 1e-3 * abs(least):
                             break
                         best, least, moved = tried, found, True
             if not moved:

@@ -26,7 +26,7 @@ def _column(x: Any, u: Any, d: Any, w: Any) -> list[Any]:
 class ColumnScheme:
     """Top impurity by reflux, bottom impurity by steam a back-off below its limit; the drop takes over the steam.
 
-    A low selector of two PI, and feed-forward of the feed to the steam and of the steam to the reflux.
+    A low selector of two PI, and feedforward of the feed to the steam and of the steam to the reflux.
     """
 
     def __init__(self, plant: OperatedPlant, numbers: Array) -> None:
