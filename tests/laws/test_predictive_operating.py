@@ -95,21 +95,6 @@ def test_a_rate_of_the_plant_is_planned_with_as_without(tmp_path: Path) -> None:
     export(laws[1], tmp_path / "law.onnx", case="made", provenance={})
 
 
-def test_several_mvs_with_rates_get_more_sweeps_and_come_to_the_end_of_their_plan() -> None:
-    """Both MVs replace each other for y0, u1 costs, and what the first plan asks is what 400 sweeps do."""
-    model, signals = lags([[1.0, 0.9], [0.2, 0.3]], [0.9, 0.85]), made_signals(2, 2)
-    slow = replace(signals, sp=signals.sp[:1], mv=tuple(replace(s, max_move=0.05) for s in signals.mv))
-    plain = Predictive(slow, model, Predictive.Params())
-    assert (plain.planner.passes, plain.planner.sweeps) == (2, 4)
-    asked = {"y1.high": 0.1, "u1.cost": 1.0}
-    given = [Predictive.Params(operate=asked), Predictive.Params(operate=asked, passes=4, sweeps=400)]
-    laws = [Predictive(slow, model, p).eval() for p in given]
-    assert laws[0].planner.sweeps > plain.planner.sweeps
-    own, best = (operated(law, model, 60, np.array([0.3]), lambda _k: Operate(laws[0].operate).default) for law in laws)
-    np.testing.assert_allclose(own[1], best[1], atol=0.01)
-    assert np.abs(np.diff(own[1], axis=0)).max() <= 0.05 + 1e-9
-
-
 # --------------------------------------------------------------------------------------------------------------- ranges
 def test_a_variable_without_a_set_point_is_left_alone_within_its_range(wide: tuple[Predictive, Operate]) -> None:
     law, operate = wide

@@ -216,7 +216,7 @@ class ExplainedPredictive(nn.Module):
         """
         low, high, plan, near = last.low, last.high, last.plan, self.near
         planner = self.law.planner
-        if planner.rate is not None and not planner.apart_moves:
+        if planner.rate is not None:
             middle = plan @ planner.before + problem.applied @ planner.first
             low, high = planner.ends(middle, (low, high, by.rate))
         used = by.reach > 0

@@ -33,8 +33,7 @@ class PredictiveParams:
     in units of the noise's; q_d None: 3e-5 over the noise. ``jumps`` > 0: share of the observer's jump after a step of
     a load; less calms loops over a plant that is not the model. ``loads`` act on the ``mvs``, where
     there are as many as outputs, or else on the ``outputs``.
-    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; None: 2 of 4, and 4 of 12 with
-    ``operate``, several MVs and a rate. ``damping`` kappa of a pass, 0 or more; None: .5 of
+    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or more; None: .5 of
     one MV, .25 of several, and with a search the least that the loops stand. ``tuning``: ``given`` takes these numbers,
     ``search`` starts from them and chooses speed, caution, horizon and jumps in closed loops over the model with errors
     and loads, drawn by ``seed``. ``mv_rate`` [mv]: largest MV change a sample, which the plan knows, one number or one
@@ -60,8 +59,8 @@ class PredictiveParams:
     jumps: float = 1.0
     loads: Where = "mvs"
     damping: float | None = None
-    passes: int | None = None
-    sweeps: int | None = None
+    passes: int = 2
+    sweeps: int = 4
     tuning: Literal["given", "search"] = "given"
     seed: int = 0
     mv_rate: Rates = None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, ClassVar, NamedTuple, Self
 
 import torch
@@ -39,10 +38,6 @@ from loopwright.serving.guard import READ_BACK_MARGIN
 # Of the searched numbers, for a plant on which they do not hold:
 CALM_SPEED = 0.3  # moves weigh eleven times as much
 CALM_JUMPS = 0.1  # the observer takes a swing of its own loop for steps of a load less
-EFFORT = (2, 4)  # passes and sweeps of each
-# With `operate`, several MVs and a rate. On the furnace and the column of the benchmark of plants under ranges and
-# costs, day 901, errors were 3.4 and 4.6 % with 3 passes of 8, and 3.2 and 4.3 % with these.
-HARD_EFFORT = (4, 12)
 UNBOUNDED = 1e6  # scaled: no set point comes near
 
 
@@ -144,11 +139,7 @@ class Predictive(ControlLaw):
         bounds = self._bounds(model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
-        hard = params.operate is not None and rate is not None and n_mv > 1
-        passes, sweeps = HARD_EFFORT if hard else EFFORT
-        passes, sweeps = params.passes or passes, params.sweeps or sweeps
-        planner = partial(Planner, valleys=n_mv > n_cv, apart_moves=hard)
-        self.planner = planner(run, self.moves, cost, passes, sweeps, rate, walls)
+        self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls, valleys=n_mv > n_cv)
         self.wanted = self._set_points(model, bounds, n_o, ramp=params.preview == "ramp")
         self.ahead = ahead_of(signals, horizon) if given else None
         self.known = None if self.ahead is None else KnownFuture(self.ahead, model, n_o)

@@ -216,10 +216,8 @@ class Planner(nn.Module):
         limits: SoftLimits | None = None,
         *,
         valleys: bool = False,
-        apart_moves: bool = False,
     ) -> None:
         super().__init__()
-        self.apart_moves = apart_moves  # with operators' bounds: a rate bounds each move by itself
         self.valleys = valleys  # more MVs than set points: a step along the cost's flat directions beside the sweeps
         self.limits = limits
         self.horizon, self.passes, self.sweeps, self.m = horizon, passes, sweeps, moves.count
@@ -299,9 +297,6 @@ class Planner(nn.Module):
         of output o, p_o the cost of
         ``SoftLimits`` with its price by rank, s the stiffness; its delta and eps are larger by ``blurred``. A set point
         outside its range counts as the end of it.
-        With ``apart_moves`` a rate bounds each move by how far it brings the MV until then, and not by the move before:
-        bounds of one move each let sweeps come to the minimum. The first move keeps the rate; later ones may turn back
-        faster, and the next samples plan them anew.
         """
         stiff = by.stiffness * self.moved + by.rest_weight * self.eye
         at = applied @ self.first
@@ -324,7 +319,7 @@ class Planner(nn.Module):
             pull = product(back, run.slopes_t, held)
             before = plan
             curvature, pull = self._damped(run.slopes * both, run.slopes_t, stiff, pull, plan)
-            if self.rate is None or self.apart_moves:
+            if self.rate is None:
                 plan = self._descended_within(curvature, pull, plan, middle, half)
             else:
                 plan = self.descended(curvature, pull, plan, at, (low, high, by.rate))
