@@ -225,12 +225,18 @@ class Successor:
         courses: Courses | None = None,
         away: Those | None = None,
         held: Array | None = None,
+        those: Those | None = None,
     ) -> None:
         """One scan; ``past`` ends with the sample before it, ``wishes`` are values of ``operate`` that somebody set.
 
         ``courses`` are those of the loop, ``away`` (n_mv,) MVs that the plant has, ``held`` (n_mv,) what is commanded
-        of those out of use.
+        of ``those`` (n_mv,) that are out of use in the loop.
         """
+        stuck = np.zeros(len(self.mv_entries.able), dtype=bool) if those is None else those & ~self.mv_entries.able
+        if stuck.any():
+            names = ", ".join(s.name for s, of in zip(self.controller.manifest.mv, stuck.tolist(), strict=True) if of)
+            self.miss(f"{names} is out of use or the plant's, and this law cannot do without; take it in use first")
+            return
         try:
             self.operate = self.operating.taken_over(wishes or {})
         except ContractError as error:
@@ -275,11 +281,13 @@ class LawInputs:
     """Inputs that a law was last stepped with: the same step can be computed again from them, and looked into.
 
     ``values`` are by the inputs' names, of the loop's signals; ``unread_s`` (n_pv,) is the time since each PV was read
-    well, 0 where it was for this step.
+    well, 0 where it was for this step. ``operate`` is as operators and the plant have it; the step itself may pin an MV
+    that is out of use to what is commanded of it.
     """
 
     values: Mapping[str, Array]
     unread_s: Array
+    operate: Array
 
 
 class ActiveController:
@@ -360,27 +368,34 @@ class ActiveController:
         """
         sample = readings.sample
         self._before = tuple(self._past) if self.successor is not None else ()
-        used = self.mv_entries.told(self._bridging.used(self.operate, readings), out, held, self._given)
-        more = _inputs(self.controller, readings, used)
+        wanted = self._bridging.used(self.operate, readings)
+        more = _inputs(self.controller, readings, self.mv_entries.told(wanted, out, held, self._given))
         more |= _known(self.controller, self.courses, sp, sample)
         given = {"sp": sp, "dv": sample.dv, "mv_applied": applied, "state": self._state, **more}
         step = self.controller.step(**given)
         read = self.controller.manifest.inputs  # another one may hold anything
         values = {n: np.array(given[n], dtype=np.float64) for n in read if n in given}  # hosts reuse their arrays
-        self.stepped = LawInputs(values, self._bridging.unread_s)
+        steered = np.array(self.mv_entries.told(wanted, out, None, None))
+        self.stepped = LawInputs(values, self._bridging.unread_s, steered)
         if self._past.maxlen:
             self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
         self._state, self._given = step.state, np.array(step.mv)  # the host gets step.mv, may write into it
         return step
 
     def beside(
-        self, sample: Sample, sp: Array, applied: Array, away: Those | None = None, held: Array | None = None
+        self,
+        sample: Sample,
+        sp: Array,
+        applied: Array,
+        away: Those | None = None,
+        held: Array | None = None,
+        those: Those | None = None,
     ) -> Array | None:
         """The successor's MV (n_mv,); once it is ready, it has the plant from the next scan on."""
         new = self.successor
         if new is None:
             return None
-        new.step(sample, sp, applied, self._before, self.wishes, self.courses, away, held)
+        new.step(sample, sp, applied, self._before, self.wishes, self.courses, away, held, those)
         if new.ready:
             self.replaced, self.successor = self.controller, None
             self.controller, self._state, self.stepped = new.controller, new.state, None

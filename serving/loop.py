@@ -298,7 +298,7 @@ class ControlLoop:
     # ------------------------------------------------------------------ one scan
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
-        self._sp = self.courses.followed(self._sp)
+        self._sp = self.courses.followed(self._sp, self.controller.manifest.sp)
         sample = self._out.look(sample, self._active.mv_entries, lost=self._applied.lost)
         readings = self._active.look(sample, self._out.local.why)
         reason, self._refused_why = readings.reason, ""
@@ -336,13 +336,14 @@ class ControlLoop:
             return self._without_sample(first_line(error), by_hand=False)
         # Once it was asked, the plant's own controller may have the plant already.
         if self.fault and not self._handing_back() and self._mode.recovers(self.recover_after):
-            self.set_mode(Mode.AUTO)
+            self._transfer.begin()  # nobody has said that an MV which is elsewhere follows its commands again
+            self._mode.set(Mode.AUTO)
         if self.mode is Mode.AUTO:
             self._mv = self._out.without(self._mv, self._transfer.limited(step.mv, applied))
         elif self.mode is Mode.SHADOW:
             self._mv = applied.copy()
         before = self.controller
-        beside = self._active.beside(readings.sample, self._sp, applied, self._out.local.away, held)
+        beside = self._active.beside(readings.sample, self._sp, applied, self._out.local.away, held, self._out.those)
         if self.controller is not before:
             self._transfer.begin()
         self._lasting()
@@ -354,8 +355,9 @@ class ControlLoop:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
         self._applied.arrived()
         self.found = None
-        self._sp = self.courses.followed(self._sp)
+        self._sp = self.courses.followed(self._sp, self.controller.manifest.sp)
         self._active.missed(1)
+        self._mv = self._out.follow(self._mv, None, self._applied, self.mode, self._active.in_hand)
         return self._without_sample(reason)
 
     def _without_sample(self, reason: str, *, silent: bool = False, by_hand: bool = True) -> Command:

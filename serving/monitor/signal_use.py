@@ -68,7 +68,7 @@ class UseOfSignals:
         """The use at a scan; ``operate`` (n_operate,) is what operators want, None: the law's own defaults."""
         stale = None if sample is None or sample.fresh is None else np.asarray(sample.fresh).tobytes()
         of = None if operate is None else operate.tobytes()
-        key = (of, stale, tuple(command.bridged), tuple(command.shed))
+        key = (of, stale, tuple(command.bridged), tuple(command.shed), tuple(command.local))
         found = self._known.get(key)
         if found is None:
             if len(self._known) >= KNOWN_SCANS:
@@ -98,7 +98,9 @@ class UseOfSignals:
             used=tuple(used),
             tracked=tuple(tracked),
             fresh=tuple(bool(n) and s.name not in bad for s, n in zip(m.pv, new, strict=True)),
-            moved=tuple(value(at, "use", 1.0) > 0 for at in self._mv),
+            moved=tuple(
+                value(at, "use", 1.0) > 0 and s.name not in command.local for at, s in zip(self._mv, m.mv, strict=True)
+            ),
             low=tuple(value(at, "low", -inf) for at in self._cv),
             high=tuple(value(at, "high", inf) for at in self._cv),
             mv_low=tuple(value(at, "low", s.low) for at, s in zip(self._mv, m.mv, strict=True)),

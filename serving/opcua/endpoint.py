@@ -160,7 +160,8 @@ class OpcUaEndpoint:
         )
         sample = replace(sample, local=values.local) if values.local else sample
         sample = self._late_apart(sample, values, late, now) if late and self._sampling.apart else sample
-        return self._analysers.look(sample, values.arrived_s) if self._sampling.apart else sample
+        sample = self._analysers.look(sample, values.arrived_s)
+        return sample if self._sampling.apart else replace(sample, fresh=None)
 
     def _late(self, values: Values, now: float) -> list[str]:
         """The signals that are too old, where others are not."""

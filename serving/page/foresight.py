@@ -6,13 +6,13 @@ step. The loop never steps it.
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopwright.serving.errors import ContractError, LoopError
+from loopwright.serving.preview.course import is_number
 
 if TYPE_CHECKING:
     from loopwright.serving.explain import Explainer
@@ -55,14 +55,17 @@ class LawForesight:
         ContractError for a value that is no number, or that is not allowed; its ``entry`` names which.
         """
         for name, value in changes.items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            if not is_number(value):
                 error = ContractError(f"{name} is {value!r}; it needs a number")
                 error.entry = str(name)
                 raise error
         asked = self._asked()
         with self._lock:
             explainer = self._explainer_of(asked)
-            return {"time": asked["time"], **explainer.what_if(changes, **_given(asked, explainer)).row()}
+            given = _given(asked, explainer)
+            if "operate" in given:  # as operators have it: the step may have pinned an MV that is out of use
+                given["operate"] = asked["operate"]
+            return {"time": asked["time"], **explainer.what_if(changes, **given).row()}
 
     def _asked(self) -> View:
         answer = self._inputs()
@@ -91,4 +94,9 @@ def _given(asked: View, explainer: Explainer) -> dict[str, Any]:
         if name in inputs:
             known = asked["signals"][group]
             inputs[name] = [inputs[name][known.index(s.name)] for s in explainer.manifest.signals(group)]
+    if "ahead" in inputs:  # of the loop's set points and measured disturbances, sample by sample
+        n_sp, known = len(explainer.manifest.sp), asked["signals"]["dv"]
+        own = [*range(n_sp), *(n_sp + known.index(s.name) for s in explainer.manifest.dv)]
+        width = n_sp + len(known)
+        inputs["ahead"] = [inputs["ahead"][k + i] for k in range(0, len(inputs["ahead"]), width) for i in own]
     return inputs

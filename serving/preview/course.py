@@ -72,6 +72,7 @@ class Courses:
         self._period_s = manifest.period_s
         self._periods = 0  # that have passed since the loop began
         self._of: dict[str, Course] = {}
+        self._left: tuple[str, ...] = ()  # signals whose course left the range of the controller in charge
         self.finished: tuple[str, ...] = ()  # signals whose course came to its last point at the last scan
 
     @property
@@ -148,19 +149,28 @@ class Courses:
             del self._of[name]
         return ended
 
-    def followed(self, sp: Array) -> Array:
-        """The set points (n_sp,) at the scan that comes next."""
-        now, found = self.now_s, sp
+    def followed(self, sp: Array, signals: Sequence[Signal] | None = None) -> Array:
+        """The set points (n_sp,) at the scan that comes next.
+
+        A course that leaves the range of its set point among ``signals``, as the controller in charge has it, ends.
+        """
+        now, found, left = self.now_s, sp, list[str]()
         for i, s in enumerate(self._sp):
             if s.name in self._of:
                 course = self._of[s.name] = self._of[s.name].begun(now, float(found[i]))
                 found = found.copy() if found is sp else found
-                found[i] = course.at(np.array([now]), float(found[i]))[0]
+                wanted = course.at(np.array([now]), float(found[i]))[0]
+                if signals is None or signals[i].low <= wanted <= signals[i].high:
+                    found[i] = wanted
+                else:
+                    left.append(s.name)
+        self._left = self.end(left)
         return found
 
     def over(self) -> None:
         """Forget the courses whose last point has come; ``finished`` are their names."""
-        self.finished = self.end([name for name, of in self._of.items() if of.times_s[-1] <= self.now_s])
+        done = self.end([name for name, of in self._of.items() if of.times_s[-1] <= self.now_s])
+        self.finished, self._left = (*self._left, *done), ()
 
     def ahead(self, manifest: Manifest, sp: Array, dv: ArrayLike | None) -> Array | None:
         """``ahead`` (N n,) of a controller at this scan, within its signals' ranges.
@@ -194,13 +204,19 @@ def _pairs(name: str, points: Any) -> list[tuple[float, float]]:
     if not 1 <= len(rows) <= MOST_COURSE_POINTS:
         raise LoopError(f"the course of {name} has {len(rows)} points; it must have 1 to {MOST_COURSE_POINTS}")
     for row in rows:
-        if not isinstance(row, Sequence) or isinstance(row, str) or len(row) != 2 or not all(map(_is_number, row)):
+        if not isinstance(row, Sequence) or isinstance(row, str) or len(row) != 2 or not all(map(is_number, row)):
             raise LoopError(f"the course of {name} has the point {shown(row)}; it needs a time in s and a value")
     return [(float(t), float(v)) for t, v in rows]
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+def is_number(value: object) -> bool:
+    """Whether a value of JSON or of a host is a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return isfinite(value)
+    except OverflowError:  # an integer of some hundred digits
+        return False
 
 
 def described(points: Mapping[str, Points], signals: Iterable[Signal]) -> str:

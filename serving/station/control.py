@@ -79,11 +79,17 @@ def asked(path: Path, request: Answer, patience_s: float = CONTROL_PATIENCE_S) -
     A swap is waited for longer: the loop first has the new file tried by another process.
     """
     patience_s += DEADLINE_S if isinstance(request, dict) and request.get("do") == "swap" else 0.0
+    text = json.dumps(request).encode() + b"\n"
+    if len(text) > LONGEST_REQUEST:
+        raise LoopError(
+            f"the request has {len(text)} bytes; the loop takes {LONGEST_REQUEST}: give a course in fewer points, or "
+            "signal by signal"
+        )
     try:
         with socket.socket(socket.AF_UNIX) as wire:
             wire.settimeout(patience_s)
             wire.connect(str(path))
-            wire.sendall(json.dumps(request).encode() + b"\n")
+            wire.sendall(text)
             with wire.makefile("rb") as said:
                 line = said.readline()
         answer = json.loads(line)

@@ -13,6 +13,7 @@ from typing import Any, Self
 from loopwright.serving.errors import LoopError
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.loop import ControlLoop
+from loopwright.serving.preview.course import is_number
 from loopwright.serving.words import first_line
 
 STEERED = "steered"  # what it is kept under
@@ -27,10 +28,11 @@ class Steered:
     operate: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, loop: ControlLoop) -> Self:
-        """The values of a loop now."""
-        controller = loop.controller
+    def of(cls, loop: ControlLoop, before: Steered | None = None) -> Self:
+        """The values of a loop now; a set point on its course as it was ``before``, which is what somebody set."""
+        controller, courses = loop.controller, loop.courses.ends
         sp = {s.name: v for s, v in zip(controller.manifest.sp, loop.sp.tolist(), strict=True)}
+        sp |= {} if before is None else {name: v for name, v in before.sp.items() if name in courses and name in sp}
         return cls(controller.sha256, sp, loop.wishes)
 
     @classmethod
@@ -97,4 +99,4 @@ class Steered:
 def _numbers(tree: Any) -> dict[str, float]:
     """The numbers by name of what a journal holds, which anybody may have changed."""
     found = tree if isinstance(tree, dict) else {}
-    return {str(n): float(v) for n, v in found.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+    return {str(n): float(v) for n, v in found.items() if is_number(v)}

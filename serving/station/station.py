@@ -266,7 +266,7 @@ class Station:
             self.endpoint.serve(self.loop.controller.manifest)
         if not np.isnan(command.mv).any():
             self._left_at = command.mv
-        steered = Steered.of(self.loop)
+        steered = Steered.of(self.loop, self._steered)
         if steered != self._steered:
             self._steered = steered
             steered.keep(self.journal)

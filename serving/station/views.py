@@ -194,6 +194,7 @@ def inputs(station: Station) -> View:
         "sha256": seen.controller.sha256,
         "signals": {name: [s.name for s in m.signals(name)] for name in ("pv", "dv")},
         "inputs": {name: value.tolist() for name, value in seen.inputs.values.items()},
+        "operate": seen.inputs.operate.tolist(),
     }
 
 
