@@ -230,6 +230,9 @@ class MadePlant:
         self.known: Array | None = None  # shape: (n_mv,), the last read-back that some actuator can have
         self.mode: Callable[[], Mode] = lambda: Mode.MANUAL  # of the loop, now
         self.held = False  # whether HOLD moves nothing
+        self.theirs: Callable[[], NDArray[np.bool_]] = lambda: np.zeros(
+            len(self.low), dtype=bool
+        )  # MVs in hand, or local
 
     def read(self) -> Sample:
         """The present sample."""
@@ -311,7 +314,8 @@ class MadePlant:
             least = np.min([np.abs(mv - at) for at in froms], axis=0)
             if (least > self.most).any():
                 add("wrote faster than its rate", f"{froms} to {mv} in {self.mode()}")
-            if self.mode() is Mode.HOLD and self.held and (least > (READ_BACK_MARGIN + ROUNDING) * self.span).any():
+            moved = (least > (READ_BACK_MARGIN + ROUNDING) * self.span) & ~self.theirs()
+            if self.mode() is Mode.HOLD and self.held and moved.any():
                 add("HOLD moves", f"{froms} to {mv}")
         if self.mode() is Mode.SHADOW:
             add("SHADOW writes", str(mv))

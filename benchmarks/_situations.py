@@ -252,8 +252,8 @@ def _by_hand(loop: MadeLoop) -> None:
 
 Y = range(3)
 SITUATIONS = (
-    _of("the set point of y0 rises", _set_point(0.15), ("set_point", "y0")),
-    _of("the set point of y0 falls", _set_point(-0.15), ("set_point", "y0")),
+    _of("the set point of y0 rises", _set_point(0.15), ("setpoint", "y0")),
+    _of("the set point of y0 falls", _set_point(-0.15), ("setpoint", "y0")),
     _of("d0 rises", _disturbance(0.3), ("disturbance", "d0")),
     _of("d0 falls", _disturbance(-0.3), ("disturbance", "d0")),
     _of("a load at y0", _load, ("load", "y0")),
@@ -268,10 +268,10 @@ SITUATIONS = (
     _of("the low limit of u0 comes above it", _narrowed_low, ("mv_low", "u0"), mv="u0"),
     _of("a limit of u0, and what u1 does then", _narrowed_high, ("mv_high", "u0"), mv="u1"),
     _of("u0 is out, and a set point rises", _out, ("not_in_use", "u0"), mv="u0"),
-    _of("u0 is out, and what u1 does then", _out, ("set_point", "y0"), mv="u1"),
+    _of("u0 is out, and what u1 does then", _out, ("setpoint", "y0"), mv="u1"),
     _of("a set point out of reach", _out_of_reach, ("mv_high", "u0"), ("mv_low", "u0"), mv="u0"),
-    _of("u0 is slow, and a set point rises", _slow, ("set_point", "y0"), mv="u0"),
+    _of("u0 is slow, and a set point rises", _slow, ("setpoint", "y0"), mv="u0"),
     _of("a range of y0 leaves its set point out", _narrowed_range, ("range_high", "y0")),
-    _of("y0 follows its set point again", _tracked_again, ("set_point", "y0")),
-    _of("u0 was moved by hand", _by_hand, *(("set_point", f"y{i}") for i in Y), mv="u0"),
+    _of("y0 follows its set point again", _tracked_again, ("setpoint", "y0")),
+    _of("u0 was moved by hand", _by_hand, *(("setpoint", f"y{i}") for i in Y), mv="u0"),
 )

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import torch
 from _fuzzed_plants import KINDS, Findings, MadePlant, Watched, WatchedGuard, laws_of
+from numpy.typing import NDArray
 
 from loopwright.serving import Fallback, Frozen, Guard, LoopError, Rate, Sample, VirtualClock, default_guards
 from loopwright.serving.guard import kind_of
@@ -64,6 +65,7 @@ class History:
             critical=[m.pv[0].name] if rng.random() < 0.2 else [],
         )  # fmt: skip
         self.plant.mode = lambda: self.loop.mode
+        self.plant.theirs = self._theirs
         self.plant.written = known
 
     def run(self, scans: int = SCANS) -> Findings:
@@ -103,6 +105,12 @@ class History:
             plant.deaf = int(rng.integers(0, 6))
         if rng.random() < 0.01:
             plant.silent = int(rng.integers(0, 6))
+
+    def _theirs(self) -> NDArray[np.bool_]:
+        """The MVs (n_mv,) that operators have in hand, or the plant has: these may move in HOLD."""
+        loop, at = self.loop, Operate(self.loop.controller.manifest.operate).places
+        used = [loop.operate[at[f"{s.name}.use"]] if f"{s.name}.use" in at else 1.0 for s in loop.manifest.mv]
+        return np.array([s.name in loop.local or not u for s, u in zip(loop.manifest.mv, used, strict=True)])
 
     def _observe(self, sample: Sample | None, command: Command) -> None:
         seen, plant = self.findings.seen, self.plant

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 
@@ -86,3 +88,18 @@ def parts(plant: EquationPlant) -> dict[str, Model]:
     )  # fmt: skip
     assert cv.low < center < cv.high
     return {"identified": model}
+
+
+@dataclass(frozen=True)
+class AllRead:
+    """As much of a scaled record as a search asks for, each row with a new reading."""
+
+    y: np.ndarray
+    v: np.ndarray
+
+    @property
+    def readings(self) -> int:
+        return self.y.size
+
+    def rows(self, rows: slice) -> AllRead:
+        return AllRead(self.y[rows], self.v[rows])

@@ -74,6 +74,8 @@ def _share(percent: float | None, default: float) -> float:
 # ------------------------------------------------------------------------------------------------ tests of params.yaml
 def check_operated(case: Case, own: Mapping[str, OperatedTestParams]) -> None:
     """ParamsError for a test of params.yaml that names a signal which the plant has not, before any law is designed."""
+    if not own:
+        return
     pv, mv = (case.plant_class.pv_signals, case.plant_class.mv_signals)
     known = [f"{s.name}.{what}" for s in pv for what in sorted(OF_GROUP["cv"])]
     known += [f"{s.name}.{what}" for s in mv for what in sorted(OF_GROUP["mv"])] + sorted(OF_GROUP["law"])

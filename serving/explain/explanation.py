@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 Cause: TypeAlias = Literal[
-    "set_point", "range_low", "range_high", "disturbance", "forecast", "load", "cost", "rest", "mv_low", "mv_high",
+    "setpoint", "range_low", "range_high", "disturbance", "forecast", "load", "cost", "rest", "mv_low", "mv_high",
     "max_move", "not_in_use", "plan",
 ]  # fmt: skip
 
@@ -34,7 +34,7 @@ class SignalCourse:
 class MovePart:
     """A part of an MV's next move, in the MV's unit: what this cause alone adds to it.
 
-    ``set_point``: a CV is predicted off its set point while the MVs stand still. ``range_low`` and ``range_high``: an
+    ``setpoint``: a CV is predicted off its set point while the MVs stand still. ``range_low`` and ``range_high``: an
     end of a CV's range. ``disturbance``: a measured disturbance changed since the last step. ``load``: a reading
     of a CV is not the predicted one, so that something not measured acts. ``cost`` of a CV or an MV, ``rest``: of an
     MV to its resting value. ``mv_low`` and ``mv_high``: an MV is at a limit, ``max_move``: it moves no faster;

@@ -43,7 +43,7 @@ def words(part: MovePart, news: Mapping[str, float]) -> str:
     """A cause in words."""
     name, up = part.signal, news.get(part.signal, 0.0) >= 0
     return {
-        "set_point": f"{name} towards its set point",
+        "setpoint": f"{name} towards its set point",
         "range_low": f"{name} towards its low limit",
         "range_high": f"{name} towards its high limit",
         "disturbance": f"{name} {'rose' if up else 'fell'}",

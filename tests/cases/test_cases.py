@@ -7,6 +7,8 @@ import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
+from loopwright.serving.manifest import Manifest
 
 DISTURBANCES = {"tin", "ua", "ua_gradual"}
 
@@ -219,7 +222,7 @@ def test_a_case_without_tests_is_one_error() -> None:
     with pytest.raises(ParamsError, match=r"has no tests: its scenarios\(\) is empty; return at least one"):
         NoTests().tests()
     with pytest.raises(ParamsError, match="has no tests"):
-        first_scenario(NoTests(), None)
+        first_scenario(NoTests(), None, cast(Manifest, SimpleNamespace(operate=())))
 
 
 def test_a_test_without_sequences_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -142,7 +142,7 @@ def test_the_perfect_nmpc_sees_the_step(case: OwnCase) -> None:
 class Noted:
     """A controller that notes the measured disturbances that it is given, and keeps its MV."""
 
-    manifest = SimpleNamespace(info=())
+    manifest = SimpleNamespace(info=(), operate=(), inputs=())
 
     def __init__(self) -> None:
         self.given: list[np.ndarray] = []

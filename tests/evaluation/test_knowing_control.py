@@ -31,6 +31,8 @@ class AtEnd:
 
     class manifest:  # noqa: N801
         info: tuple[str, ...] = ()
+        operate: tuple[str, ...] = ()
+        inputs: tuple[str, ...] = ()
 
     def __init__(self, mv: float) -> None:
         self.mv = mv

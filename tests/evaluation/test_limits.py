@@ -24,7 +24,7 @@ Law = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 class Told:
     """A controller whose MV is a function of set point, PV and sample."""
 
-    manifest = SimpleNamespace(info=())
+    manifest = SimpleNamespace(info=(), operate=(), inputs=())
 
     def __init__(self, law: Law) -> None:
         self.law, self.k = law, -1

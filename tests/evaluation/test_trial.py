@@ -22,6 +22,8 @@ from loopwright.serving.manifest import Signal
 @dataclass
 class Told:
     info: tuple[str, ...] = ("error", "steps")
+    operate: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
 
 
 class Proportional:

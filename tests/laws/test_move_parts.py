@@ -149,7 +149,7 @@ def test_an_mv_out_of_use_has_no_other_part() -> None:
     loop.sp[0] += 0.2
     out, other = loop.moves()
     assert (out.move, out.first.cause) == (0.0, "not_in_use")
-    assert (other.first.cause, other.first.signal) == ("set_point", "y0")
+    assert (other.first.cause, other.first.signal) == ("setpoint", "y0")
 
 
 def test_a_law_without_operate_explains_nothing() -> None:

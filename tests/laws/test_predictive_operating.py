@@ -223,7 +223,7 @@ def test_costs_lead_to_the_cheapest_plant_within_its_ranges(wide: tuple[Predicti
     asked = operate.with_values(ends | {f"u{i}.cost": p for i, p in enumerate(prices)})
     y, mv = operated(law, WIDE, 400, np.zeros(2), lambda _k: asked)
     inside = y[-1].min() - 0.4  # the margin of the estimate's own error
-    assert 0 <= inside < 0.02
+    assert 0 <= inside < 0.03
     gains = np.array(WIDE_GAINS)
     best = linprog(prices, np.vstack([gains, -gains]), [0.6, 0.6, -0.4 - inside, -0.4 - inside], bounds=[(-1, 1)] * 3)
     assert mv[-1] @ prices == pytest.approx(best.fun, abs=0.01)

@@ -80,7 +80,7 @@ def test_a_fault_that_passes_from_one_signal_to_another_is_told(make: Any, tmp_p
     signals = SimpleNamespace(sp=(), pv=(), mv=(), dv=(), info=())
     controller: Any = SimpleNamespace(manifest=signals)
     recorder._controller = controller
-    loop: Any = SimpleNamespace(controller=controller, successor=None)
+    loop: Any = SimpleNamespace(controller=controller, successor=None, courses=SimpleNamespace(finished=()))
     for reason in (make("TIC-101"), make("TIC-101"), make("TIC-102"), ""):
         command: Any = SimpleNamespace(
             sp=(),

@@ -58,7 +58,7 @@ def test_a_file_that_is_not_trusted_is_never_parsed(
         with_evidence(signed, other, {})
         os.replace(sign(other, private("anna")), place)
     parsed: list[str] = []
-    for name in ("read_controller", "audit", "_manifest", "_session"):
+    for name in ("read_controller", "audit", "_manifest", "session_of"):
         monkeypatch.setattr(loopwright.serving.controller, name, lambda *_, name=name: parsed.append(name))
     with pytest.raises(SignatureError) as error:
         Controller(signed, trusted=[keys / "anna.pub"])

@@ -101,7 +101,7 @@ class ExplainedPredictive(nn.Module):
         signals = self.signals
         pv, dv, mv = ([s.name for s in of] for of in (signals.pv[: self.n_o], signals.dv, signals.mv))
         groups = (
-            ("set_point", pv), ("range_low", pv), ("range_high", pv), ("disturbance", dv),
+            ("setpoint", pv), ("range_low", pv), ("range_high", pv), ("disturbance", dv),
             ("forecast", dv if self.forecasts else []), ("load", pv), ("cost", [*pv, *mv]), ("rest", mv),
             ("mv_low", mv), ("mv_high", mv), ("max_move", mv), ("not_in_use", mv), ("plan", [""]),
         )  # fmt: skip

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from closed_loop_records import LOOPS, SIGNALS
+from identified_models import AllRead
 
 from loopwright.pipeline.models.identified.candidates import FitTask, on_all_rows
 from loopwright.pipeline.models.identified.dynamics import Dynamics
@@ -94,7 +96,7 @@ def searched_over(
 
     The impulse response shows ``seen`` rows, and the filter of the fit with ``exploded`` runs away in training.
     """
-    data = type("Rows", (), {"y": np.zeros((2_000, 1)), "v": np.zeros((2_000, 1))})()
+    data: Any = AllRead(np.zeros((2_000, 1)), np.zeros((2_000, 1)))
     folds = (Fold(slice(0, 1_000), slice(1_000, 2_000)),)
     rounds = Rounds(Problem(data, folds, 1, known=known or Knowledge()), Budget(9.0, 2_000, 1), "test")
     shown = [Structure("balanced", 0, (0, 0), (d,)) for d in dict.fromkeys([0, seen])]

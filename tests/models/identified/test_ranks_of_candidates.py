@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from identified_models import AllRead
 
 from loopwright.pipeline.models.identified.candidates import wild
 from loopwright.pipeline.models.identified.dynamics import Dynamics
@@ -57,7 +58,7 @@ def test_an_output_that_an_input_does_not_move_says_nothing_of_its_dead_time() -
 
 def two_folds() -> Problem:
     """A record of two halves, each held out once."""
-    data = type("Rows", (), {"y": np.zeros((2_000, 1)), "v": np.linspace(-0.5, 0.5, 2_000)[:, None]})()
+    data: Any = AllRead(np.zeros((2_000, 1)), np.linspace(-0.5, 0.5, 2_000)[:, None])
     folds = (Fold(slice(0, 1_000), slice(1_000, 2_000)), Fold(slice(1_000, 2_000), slice(0, 1_000)))
     return Problem(data, folds, 1)
 
