@@ -188,8 +188,18 @@ def _gone(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
         good = yield KitScan("after all PVs were bad", good)
 
 
+def _apart(m: Manifest) -> set[str]:
+    """The MVs that a law can do without.
+
+    This runtime goes on without one that is read back badly or elsewhere alone; a host may hold all of them.
+    """
+    return {e.signal for e in m.operate if e.group == "mv" and e.what == "use"} if "operate" in m.inputs else set()
+
+
 def _moved(m: Manifest, good: Sample) -> Sample:
-    """The sample after somebody has moved each MV far from where it stood."""
+    """The sample after somebody has moved each MV far from where it stood; as it is where the law can do without some."""
+    if _apart(m):
+        return good
     assert good.mv_applied is not None
     to = [
         (s.low + (0.8 if at < s.middle else 0.2) * (s.high - s.low))
@@ -208,10 +218,8 @@ def _doubtful(m: Manifest) -> Iterator[tuple[str, _Spoil]]:
         yield from _around("PV", "pv", i, s, InRange(m.pv).margin)
     for i, s in enumerate(m.dv if "dv" in m.inputs else ()):
         yield f"DV {s.name} not finite", _Spoil("dv", i, nan)
-    # This runtime goes on without an MV that is read back badly alone, where the law can; a host may hold all of them.
-    apart = {e.signal for e in m.operate if e.group == "mv" and e.what == "use"} if "operate" in m.inputs else set()
     for i, s in enumerate(m.mv):
-        if s.name in apart:
+        if s.name in _apart(m):
             continue
         yield f"applied MV {s.name} not finite", _Spoil("mv_applied", i, nan)
         if s.values is None:
