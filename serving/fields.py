@@ -58,7 +58,17 @@ def _bits(value: int) -> int:
 T = TypeVar("T")
 
 
-MOST_KNOWN = 12  # names in a message: a longer list hides the one that is meant
+def is_number(value: object) -> bool:
+    """Whether a value of JSON or of a host is a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # an integer of some hundred digits
+        return False
+
+
+MOST_KNOWN = 24  # names in a message, as of all laws: a longer list hides the one that is meant
 
 
 def nearest(word: object, known: Iterable[str]) -> str:

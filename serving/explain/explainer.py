@@ -14,8 +14,15 @@ from loopwright.serving.controller import Controller, session_of
 from loopwright.serving.controller_file import read_controller
 from loopwright.serving.errors import ArtifactError, ContractError, OutputError
 from loopwright.serving.explain.explain_file import controller_path, explain_manifest
-from loopwright.serving.explain.explanation import Cause, ExplainedMove, Explanation, MovePart, SignalCourse, WhatIf
-from loopwright.serving.explain.sentence import sentence_of
+from loopwright.serving.explain.explanation import (
+    Cause,
+    ExplainedMove,
+    Explanation,
+    MovePart,
+    SignalCourse,
+    WhatIf,
+    sentence_of,
+)
 from loopwright.serving.fields import nearest, shown
 from loopwright.serving.graph.audit import audit
 from loopwright.serving.operating import Operate

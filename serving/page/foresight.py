@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from loopwright.serving.errors import ContractError, LoopError
-from loopwright.serving.preview.course import is_number
+from loopwright.serving.fields import is_number
 
 if TYPE_CHECKING:
     from loopwright.serving.explain import Explainer

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loopwright.serving.errors import LoopError
-from loopwright.serving.fields import nearest, shown
+from loopwright.serving.fields import is_number, nearest, shown
 from loopwright.serving.manifest import Manifest, Signal
 from loopwright.serving.preview.differences import Differences
 from loopwright.serving.ranges import within
@@ -149,7 +149,7 @@ class Courses:
             del self._of[name]
         return ended
 
-    def followed(self, sp: Array, signals: Sequence[Signal] | None = None) -> Array:
+    def followed(self, sp: Array, signals: Sequence[Signal]) -> Array:
         """The set points (n_sp,) at the scan that comes next.
 
         A course that leaves the range of its set point among ``signals``, as the controller in charge has it, ends.
@@ -160,7 +160,7 @@ class Courses:
                 course = self._of[s.name] = self._of[s.name].begun(now, float(found[i]))
                 found = found.copy() if found is sp else found
                 wanted = course.at(np.array([now]), float(found[i]))[0]
-                if signals is None or signals[i].low <= wanted <= signals[i].high:
+                if signals[i].low <= wanted <= signals[i].high:
                     found[i] = wanted
                 else:
                     left.append(s.name)
@@ -207,16 +207,6 @@ def _pairs(name: str, points: Any) -> list[tuple[float, float]]:
         if not isinstance(row, Sequence) or isinstance(row, str) or len(row) != 2 or not all(map(is_number, row)):
             raise LoopError(f"the course of {name} has the point {shown(row)}; it needs a time in s and a value")
     return [(float(t), float(v)) for t, v in rows]
-
-
-def is_number(value: object) -> bool:
-    """Whether a value of JSON or of a host is a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    try:
-        return isfinite(value)
-    except OverflowError:  # an integer of some hundred digits
-        return False
 
 
 def described(points: Mapping[str, Points], signals: Iterable[Signal]) -> str:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, Self
 
 from loopwright.serving.errors import LoopError
+from loopwright.serving.fields import is_number
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.loop import ControlLoop
-from loopwright.serving.preview.course import is_number
 from loopwright.serving.words import first_line
 
 STEERED = "steered"  # what it is kept under

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
 from typing import Any, NamedTuple, TypeAlias
 
 from loopwright.serving.active_controller import require_fits
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
-from loopwright.serving.fields import nearest
+from loopwright.serving.fields import is_number, nearest, shown
 from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import ControlLoop, Mode, within
 from loopwright.serving.manifest import Signal
@@ -313,8 +312,8 @@ def _numbers(value: Any, signals: tuple[Signal, ...], present: list[float], what
     for name, number in value.items():
         if name not in names:
             raise LoopError(f"there is no {what} {name!r}{nearest(name, names)}")
-        if not isinstance(number, int | float) or isinstance(number, bool) or not isfinite(number):
-            raise LoopError(f"the {what} {name} is {number!r}; it must be a number")
+        if not is_number(number):
+            raise LoopError(f"the {what} {name} is {shown(number)}; it must be a number")
         wanted[names.index(name)] = float(number)
     return wanted
 

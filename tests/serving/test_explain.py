@@ -19,7 +19,7 @@ from loopwright.serving import ArtifactError, ContractError, Controller, Loopwri
 from loopwright.serving.controller_file import controller_files
 from loopwright.serving.explain import Explainer, MovePart
 from loopwright.serving.explain.explain_file import explain_path
-from loopwright.serving.explain.sentence import sentence_of
+from loopwright.serving.explain.explanation import sentence_of
 
 pytest_plugins = ["operated_laws"]
 MODEL = random_model(3, n_y=2, n_mv=2, n_dv=1)  # of ``operated_file``

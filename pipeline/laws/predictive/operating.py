@@ -191,9 +191,8 @@ class Operation(nn.Module):
         # A range stays dearer than every set point.
         heaviest = torch.clamp(weights.amax(dim=-1, keepdim=True), min=1.0)
         unsure = sd * p["free"]
-        sharper = torch.exp(
-            torch.clamp(self.usual - p["rank"], max=0.0)
-        )  # a dearer range is kept as much more strictly
+        # A dearer range is kept as much more strictly.
+        sharper = torch.exp(torch.clamp(self.usual - p["rank"], max=0.0))
         margin = self._samples(torch.minimum(self.margin * unsure, p["width"]))
         return OperatedPlan(
             track=p["track"] * p["use"] * self._samples(weights),
