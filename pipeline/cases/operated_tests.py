@@ -27,7 +27,7 @@ from loopwright.serving.manifest import OF_GROUP, OperateEntry, Signal
 CHANGE_AT = LOAD_AT  # sample at which operators change something: the law has begun by then
 LEAST_SAMPLES = 300  # of a test with costs or resting values, which move MVs slowly: 100 to 200 samples and a rest
 HALF_WIDTH = 0.1  # of the range that the record visited: half of a range that is narrowed ...
-NOISES_WIDE = 4.0  # ... or so many standard deviations of the noise, where that is more: the law keeps two inside
+NOISES_WIDE = 4.0  # ... or so many standard deviations of the noise, where more: the law keeps five of its estimate in
 ROOM_TO_EARN = 0.25  # of the range that the record visited, to each side of where the plant rests: room for costs
 PUSHED = 2.0  # loads of ``load_size`` that push a PV; its range is one of them wide to each side
 AT_ODDS = 0.5  # of an MV's room, to the end that is farther: what the first range asks of the only MV in use
