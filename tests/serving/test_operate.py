@@ -151,12 +151,12 @@ def test_what_was_set_outlasts_laws_that_lack_it(
     operated: Controller, otherwise_operated: Controller, not_operated: Controller
 ) -> None:
     loop = loop_of(operated, operate={"speed": 3.0})
-    loop.set_operate({"valve.use": 0.0, "T.use": 0.0})
+    loop.set_operate({"valve.high": 90.0, "T.use": 0.0})  # an MV in hand would keep the law without `use` out
     for law in (otherwise_operated, not_operated, operated):
         swapped(loop, law)
         assert loop.controller is law
     defaults = {e.name: e.default for e in operated.manifest.operate}
-    assert named(loop) == {**defaults, "speed": 3.0, "valve.use": 0.0, "T.use": 0.0}
+    assert named(loop) == {**defaults, "speed": 3.0, "valve.high": 90.0, "T.use": 0.0}
 
 
 def test_a_value_outside_the_successors_range_keeps_its_trial_from_counting(
