@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 import pytest
 from chromium import come_in
 from fake_loop import BEGIN, THIRDS, FakeLoop, opened
+from fake_loop import Browser as Knocking
+from processes import within
 
 from loopwright.serving import Controller
 
@@ -39,16 +41,20 @@ def bare(served: tuple[FakeLoop, str, str]) -> tuple[str, str]:
 def loop(served: tuple[FakeLoop, str, str], bare: tuple[str, str]) -> FakeLoop:
     """Two set points with more digits than are shown, and an MV of three values.
 
-    It stands so from one moment to the next: a page that is opened now may be answered what was asked for another one
-    before, and a loop that stood in between at its first scan would have it draw the trend up to there.
+    It stands so from one moment to the next: a loop that stood in between at its first scan would have a page draw the
+    trend up to there. The server answers with a state that is up to half a second old, so it is asked until it has this
+    one: else a page shows the mode that the test before had set.
     """
     made, (about, state) = served[0], map(json.loads, bare)
     sp = [{"name": name, "unit": "K", "low": 0.0, "high": 1.0} for name in ("a", "b")]
     signals = {"sp": sp, "pv": sp, "dv": [], "mv": [{**sp[0], "name": "u", "values": THIRDS}]}
     stands = {"sp": [0.6123456, 0.3456789], "pv": [0.5, 0.4], "mv": [1 / 3], "applied": [1 / 3], "time": BEGIN + 100}
-    made.about, made.state = {**about, "signals": signals}, {**state, **stands}
+    fixture = made.state.get("fixture", 0) + 1  # which of them this is; the page shows nothing of it
+    made.about, made.state = {**about, "signals": signals}, {**state, **stands, "fixture": fixture}
     made.unproven = ""
     made.changes.clear()
+    knocking = Knocking(int(served[1].rpartition(":")[2]), served[2])
+    assert within(20, lambda: knocking.json("/api/state").get("fixture") == fixture)
     return made
 
 
