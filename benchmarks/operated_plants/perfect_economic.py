@@ -28,7 +28,7 @@ from loopwright.pipeline.laws.predictive.operating import (
     USUAL_RANK,
 )
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.qp_solver import EPS, PRICE
+from loopwright.pipeline.laws.predictive.soft_limits import EPS, PRICE
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Array
 

@@ -16,7 +16,8 @@ from loopwright.pipeline.laws.predictive.disturbance_model import loads_of
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
 from loopwright.pipeline.laws.predictive.params import PredictiveParams, limits_of
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.qp_solver import EPS, PRICE, SOFT, Cost, Planner, SoftLimits
+from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner
+from loopwright.pipeline.laws.predictive.soft_limits import EPS, PRICE, SOFT, SoftLimits
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.equations import EquationPlant
 

@@ -13,7 +13,7 @@ from predictive_loops import closed, law_of, row
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.qp_solver import SetPointCourse
+from loopwright.pipeline.laws.predictive.set_point_course import SetPointCourse
 
 SMALL = {"horizon": 12, "moves": 5}
 changes = st.floats(-1, 1)

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import hold_numbers
-from loopwright.pipeline.laws.predictive.predictive import PlanProblem, Predictive
-from loopwright.pipeline.laws.predictive.qp_solver import AT_BOUND, LastPass, OperatedPlan
+from loopwright.pipeline.laws.predictive.predictive import Predictive
+from loopwright.pipeline.laws.predictive.qp_solver import AT_BOUND, LastPass, OperatedPlan, PlanProblem
 
 TINY_EXCESS = 1e-12  # scaled: an output that is beyond its range by less owes it to nothing new
 

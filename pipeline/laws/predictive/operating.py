@@ -13,7 +13,8 @@ from loopwright.pipeline.config.operator_defaults import MOST_COST, MOST_RANKS
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import hold_numbers
 from loopwright.pipeline.laws.predictive.horizon import Moves
-from loopwright.pipeline.laws.predictive.qp_solver import PRICE, OperatedPlan
+from loopwright.pipeline.laws.predictive.qp_solver import OperatedPlan
+from loopwright.pipeline.laws.predictive.soft_limits import PRICE
 from loopwright.pipeline.models.memory import AffineMap, Named
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.errors import LoopwrightError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, NamedTuple, Self
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -24,9 +24,10 @@ from loopwright.pipeline.laws.predictive.params import (
     refuse_discrete,
     weights_of,
 )
-from loopwright.pipeline.laws.predictive.qp_solver import PRICE, Cost, OperatedPlan, Planner, SetPointCourse, SoftLimits
-from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, in_words, tuned
-from loopwright.pipeline.laws.predictive.tuning_loops import TuningLoops
+from loopwright.pipeline.laws.predictive.qp_solver import Cost, Planner, PlanProblem
+from loopwright.pipeline.laws.predictive.set_point_course import course_of
+from loopwright.pipeline.laws.predictive.soft_limits import PRICE, SoftLimits, scaled_limits
+from loopwright.pipeline.laws.predictive.tuning import TriedNumbers, in_words, searched_params
 from loopwright.pipeline.models.base import Model
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.models.memory import AffineMap, Named
@@ -34,35 +35,6 @@ from loopwright.pipeline.plants.noise import level_gain
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.tuning.calm_choice import calmest
 from loopwright.serving.guard import READ_BACK_MARGIN
-
-# Of the searched numbers, for a plant on which they do not hold:
-CALM_SPEED = 0.3  # moves weigh eleven times as much
-CALM_JUMPS = 0.1  # the observer takes a swing of its own loop for steps of a load less
-UNBOUNDED = 1e6  # scaled: no set point comes near
-
-
-class PlanProblem(NamedTuple):
-    """A step's problem, scaled, as the planner takes it, and all that its answer needs beside the plan."""
-
-    start: Tensor  # (..., 1, n_x + n_d + n_dv) [x, d, dv]
-    wanted: Tensor  # (..., 1, N n_o) set points
-    applied: Tensor  # (..., 1, n_mv) where the MVs go on from
-    plan: Tensor  # (..., 1, m) to begin at
-    operated: OperatedPlan | None
-    forecast: Tensor | None  # of the horizon where measured disturbances change
-    mean: Tensor  # (..., 1, n_x + n_d) [x, d]
-    now: Named  # the inputs
-    kept: Named  # the state
-    fresh: Tensor | None  # (..., 1, n_y)
-    boost: Tensor  # (..., 1, n_y)
-    next_kept: Named  # what goes to the next state, in its order, the plan and the MVs apart
-    stands: Tensor  # (..., n_mv) [mv] as ``applied``
-    mv_applied: Tensor  # (..., n_mv) [mv]
-
-    @property
-    def given(self) -> tuple[Tensor, Tensor, Tensor, Tensor, OperatedPlan | None, Tensor | None]:
-        """The planner's arguments."""
-        return self.start, self.wanted, self.applied, self.plan, self.operated, self.forecast
 
 
 class Predictive(ControlLaw):
@@ -136,11 +108,11 @@ class Predictive(ControlLaw):
         n_o = n_cv if params.operate is None else model.n_y
         given = params.preview == "course"
         run = horizon_of(model, loads, self.moves, mv_of, n_o, forecasts=given)
-        bounds = self._bounds(model, params) if params.operate is None else None
+        bounds = scaled_limits(signals, model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
         self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls, valleys=n_mv > n_cv)
-        self.wanted = self._set_points(model, bounds, n_o, ramp=params.preview == "ramp")
+        self.wanted = course_of(signals, model, horizon, n_o, bounds, ramp=params.preview == "ramp")
         self.ahead = ahead_of(signals, horizon) if given else None
         self.known = None if self.ahead is None else KnownFuture(self.ahead, model, n_o)
         self.operation = None
@@ -155,28 +127,6 @@ class Predictive(ControlLaw):
             *(f"next_{s.name}" for s in signals.sp),
             *(f"boost_{s.name}" for s in signals.sp),
         )
-
-    def _bounds(self, model: Identified, params: PredictiveParams) -> tuple[Tensor, Tensor] | None:
-        """The CVs' soft limits, scaled, (n_cv,) each; None where there are none."""
-        found, n_cv = limits_of(self.signals, params), len(self.signals.sp)
-        if found is None:
-            return None
-        low, high = ((torch.from_numpy(end) - model.y_center[:n_cv]) / model.y_scale[:n_cv] for end in found)
-        return low, high
-
-    def _set_points(
-        self, model: Identified, bounds: tuple[Tensor, Tensor] | None, n_o: int, *, ramp: bool
-    ) -> SetPointCourse:
-        """The course of ``n_o`` set points over the horizon, within ``bounds``; a ramp ends at the signals' ranges."""
-        n_cv = len(self.signals.sp)
-        if ramp:
-            ends = torch.tensor([(s.low, s.high) for s in self.signals.sp], dtype=torch.float64)
-            low, high = ((end - model.y_center[:n_cv]) / model.y_scale[:n_cv] for end in ends.T)
-            if bounds is not None:
-                low, high = (torch.minimum(torch.maximum(end, bounds[0]), bounds[1]) for end in (low, high))
-            others = torch.full((n_o - n_cv,), UNBOUNDED, dtype=torch.float64)  # outputs without a set point
-            bounds = torch.cat([low, -others]), torch.cat([high, others])
-        return SetPointCourse(self.moves.horizon, n_o, bounds, ramp=ramp)
 
     def _build_operation(
         self, model: Identified, params: PredictiveParams, n_o: int, most_weight: float, middle: Tensor, half: Tensor
@@ -267,38 +217,11 @@ class Predictive(ControlLaw):
         sight = AnswerTimes.of(model, mvs_of(model, law.mv_middle, law.mv_half), len(signals.sp))
         sight.require(law.moves.horizon)
         if params.tuning == "search":
-            law = law._searched(model, params)
+            horizon = law.moves.horizon
+            found = searched_params(lambda given: cls(signals, model, given).eval(), model, signals, params, horizon)
+            law = cls(signals, model, found.params).eval()
+            law.tried, law.calmer = found.tried, (model, found.calmer)
         law.remarks = sight.notes(law.moves.horizon)
-        return law
-
-    def _searched(self, model: Identified, params: PredictiveParams) -> Self:
-        """The law with the best numbers of a search that starts from this one's.
-
-        Its set points step over the record's range, so it knows no soft limits and no recipe.
-        """
-        horizon, plain = self.moves.horizon, replace(params, cv_low=None, cv_high=None, preview="held", operate=None)
-
-        def law_of(n: Mapping[str, float], damping: float | None, given: PredictiveParams = plain) -> Any:
-            numbers: dict[str, Any] = {**n, "horizon": int(n["horizon"]), "damping": damping}
-            changed = replace(given, **numbers)
-            return type(self)(self.signals, model, changed).eval()
-
-        start = {n: float(getattr(params, n)) for n in ("speed", "caution", "jumps")} | {"horizon": float(horizon)}
-        found = tuned(TuningLoops.draw(model, self.signals, horizon, params.seed), law_of, start, params.damping)
-        law: Self = law_of(found.numbers, found.damping, params)
-        law.tried = found.tried
-        at = found.numbers
-        law.calmer = (
-            model,
-            replace(
-                params,
-                speed=CALM_SPEED * at["speed"],
-                caution=at["caution"],
-                jumps=CALM_JUMPS * at["jumps"],
-                horizon=int(at["horizon"]),
-                damping=found.damping,
-            ),
-        )
         return law
 
     def calmed(self) -> Self | None:

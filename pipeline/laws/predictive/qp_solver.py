@@ -1,4 +1,4 @@
-"""A plan over a horizon: set points, soft limits, and Gauss-Newton passes, each with a box QP by fixed sweeps."""
+"""A plan over a horizon: Gauss-Newton passes, each with a box QP by fixed sweeps."""
 
 from __future__ import annotations
 
@@ -12,69 +12,13 @@ from torch.nn.functional import hardtanh
 
 from loopwright.pipeline.laws.base import hold_numbers
 from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, NetworkHorizon, Prediction, product
-
-
-class SetPointCourse(nn.Module):
-    """Set points r(k+1) .. r(k+N) from those of now and, with ``ramp``, of the two samples before.
-
-        held:    r(k+i) = r(k)
-        ramp:    r(k+i) = clip(r(k) + i s),   s = the smaller of r(k) - r(k-1) and r(k-1) - r(k-2)
-        course:  r(k+i) = r(k) + a(i),        a(i) as it is given
-
-    s is 0 where the two changes differ in their signs or one is 0: a step of the set point is no ramp, and the slope
-    of a recipe is believed from its second sample on. ``bounds`` are the ends of the clip: the CVs' soft limits, as a
-    set point beyond a limit counts as one at the limit, and with ``ramp`` the signals' ranges too.
-    """
-
-    low: Tensor | None  # (N n_cv,) scaled
-    high: Tensor | None
-    samples: Tensor | None  # (N n_cv,) i
-
-    def __init__(self, horizon: int, n_cv: int, bounds: tuple[Tensor, Tensor] | None, *, ramp: bool) -> None:
-        super().__init__()
-        self.horizon, self.n_cv, self.ramp = horizon, n_cv, ramp
-        low, high = (None, None) if bounds is None else (end.repeat(horizon) for end in bounds)
-        samples = torch.arange(1, horizon + 1, dtype=torch.float64).repeat_interleave(n_cv) if ramp else None
-        for name, values in {"low": low, "high": high, "samples": samples}.items():
-            self.register_buffer(name, values)
-
-    def forward(self, now: Tensor, past: list[Tensor], later: Tensor | None = None) -> Tensor:
-        """The set points (..., 1, N n_cv), from ``now`` (..., 1, n_cv); ``past`` [r(k-1), r(k-2)] with ``ramp``.
-
-        ``later`` (..., 1, N n_cv) a(1) .. a(N), where the course is given.
-        """
-        course = self._held(now)
-        if self.samples is not None:
-            last, older = past
-            change, before = now - last, last - older
-            slope = torch.minimum(torch.maximum(change, before.clamp(max=0.0)), before.clamp(min=0.0))
-            course = course + self.samples * self._held(slope)
-        if later is not None:
-            course = course + later
-        if self.low is not None and self.high is not None:
-            course = torch.minimum(torch.maximum(course, self.low), self.high)
-        return course
-
-    def _held(self, values: Tensor) -> Tensor:
-        """Each of (..., 1, n_cv) at every sample of the horizon."""
-        return values.repeat(*(1 for _ in values.shape[:-1]), self.horizon)
-
+from loopwright.pipeline.laws.predictive.soft_limits import EPS, SOFT, LimitCost, SoftLimits, limit_cost
+from loopwright.pipeline.models.memory import Named
 
 LEAST_HALF = 1e-9  # of half an MV's range: a narrower one is a point
 LEAST_BEND = 1e-30  # of a cost along a direction: nothing moves
 MOST_LENGTH = 1e3  # sweeps that one step along a valley stands for
 AT_BOUND = 1e-9  # scaled: an entry this near a bound that does not move holds nothing back
-
-PRICE = 30.0  # of a scaled unit beyond a limit, in units of the largest weight of an error
-EPS = 0.03  # scaled: what lies beyond a limit by less counts by its square
-SOFT = 0.003  # scaled: where the curvature begins, so that the law has no jump at a limit
-
-
-class LimitCost(NamedTuple):
-    """For each output over the horizon: the weight of a quadratic that stands for the limits' cost, and its slope."""
-
-    weight: Tensor  # (..., 1, N n_cv)
-    slope: Tensor  # (..., 1, N n_cv)
 
 
 class OperatedPlan(NamedTuple):
@@ -103,43 +47,28 @@ class OperatedPlan(NamedTuple):
     mv_move: Tensor  # (..., 1, n_mv) [mv] a period; 0 of an MV out of use
 
 
-def limit_cost(y: Tensor, low: Tensor, high: Tensor, price: Tensor, soft: Tensor, eps_squared: Tensor) -> LimitCost:
-    """The push on outputs y (..., 1, N n_cv) that lie outside low..high, as ``SoftLimits`` says; all scaled."""
-    beyond = y - torch.minimum(torch.maximum(y, low), high)
-    size = beyond.abs()
-    weight = price * size / ((size + soft) * torch.sqrt(size * size + eps_squared))
-    return LimitCost(weight, weight * beyond)
+class PlanProblem(NamedTuple):
+    """A step's problem, scaled, as the planner takes it, and all that its answer needs beside the plan."""
 
+    start: Tensor  # (..., 1, n_x + n_d + n_dv) [x, d, dv]
+    wanted: Tensor  # (..., 1, N n_o) set points
+    applied: Tensor  # (..., 1, n_mv) where the MVs go on from
+    plan: Tensor  # (..., 1, m) to begin at
+    operated: OperatedPlan | None
+    forecast: Tensor | None  # of the horizon where measured disturbances change
+    mean: Tensor  # (..., 1, n_x + n_d) [x, d]
+    now: Named  # the inputs
+    kept: Named  # the state
+    fresh: Tensor | None  # (..., 1, n_y)
+    boost: Tensor  # (..., 1, n_y)
+    next_kept: Named  # what goes to the next state, in its order, the plan and the MVs apart
+    stands: Tensor  # (..., n_mv) [mv] as ``applied``
+    mv_applied: Tensor  # (..., n_mv) [mv]
 
-class SoftLimits(nn.Module):
-    """The cost of outputs beyond their limits: sum p(b) over all samples, with the slope of p.
-
-        p'(b) = w(b) b,   w(b) = rho |b|/((|b| + delta) sqrt(b^2 + eps^2)),   b = y - clip(y, low, high)
-
-    It is convex and of the same kind as the errors' cost sqrt(b^2 + eps^2), with a curvature that begins at 0. Its
-    slope grows to rho, above that of the errors, so that errors are left where a limit asks for it: a limit gives way
-    only where no plan within the MVs' ranges keeps it, or where it would cost the other CVs more than rho. Where they
-    would gain l < rho by a unit of b, the plan ends at p'(b) = l; that is b = .005 for l = rho/10, .02 for rho/2.
-
-    Source: exact penalties, Kerrigan and Maciejowski, Soft constraints and exact penalty functions in model
-    predictive control, UKACC International Conference Control 2000, Cambridge.
-    """
-
-    low: Tensor  # (N n_cv,) scaled
-    high: Tensor  # (N n_cv,)
-    price: Tensor  # (1,) rho
-    soft: Tensor  # (1,) delta
-    eps_squared: Tensor  # (1,)
-
-    def __init__(self, low: Tensor, high: Tensor, price: float, horizon: int) -> None:
-        super().__init__()
-        self.register_buffer("low", low.repeat(horizon))
-        self.register_buffer("high", high.repeat(horizon))
-        hold_numbers(self, price=price, soft=SOFT, eps_squared=EPS**2)
-
-    def forward(self, y: Tensor) -> LimitCost:
-        """The push on outputs y (..., 1, N n_cv), scaled."""
-        return limit_cost(y, self.low, self.high, self.price, self.soft, self.eps_squared)
+    @property
+    def given(self) -> tuple[Tensor, Tensor, Tensor, Tensor, OperatedPlan | None, Tensor | None]:
+        """The planner's arguments."""
+        return self.start, self.wanted, self.applied, self.plan, self.operated, self.forecast
 
 
 class LastPass(NamedTuple):

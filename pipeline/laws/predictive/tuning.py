@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from loopwright.pipeline.engine.progress import steps
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
-from loopwright.pipeline.laws.predictive.tuning_loops import LoopErrors, side_by_side
+from loopwright.pipeline.laws.predictive.params import PredictiveParams
+from loopwright.pipeline.laws.predictive.tuning_loops import LoopErrors, TuningLoops, side_by_side
+from loopwright.pipeline.models.identified.identified import Identified
+from loopwright.pipeline.plants.simulator import Signals
 from loopwright.pipeline.tuning.calm_choice import CALM_COST, calmest
 
 TRAVEL_COST = 0.05  # of J: what a travel of 1 % of the MVs' range a sample costs
@@ -22,6 +25,9 @@ HORIZONS = (0.7, 1.3)  # factors of the horizon that are tried
 JUMPS = (0.3, 0.1, 0.03)  # factors of the observer's jumps that are tried
 TRIED_DAMPINGS = (0.1, 0.25, 0.5, 1.0)  # less costs digits and calm, more costs speed
 FORGETS = 100.0  # growth of a small difference up to which a loop forgets it; most stay below 20
+# Of the searched numbers, for a plant on which they do not hold:
+CALM_SPEED = 0.3  # moves weigh eleven times as much
+CALM_JUMPS = 0.1  # the observer takes a swing of its own loop for steps of a load less
 
 Numbers = dict[str, float]
 """``speed``, ``caution``, ``jumps`` and ``horizon``."""
@@ -163,3 +169,42 @@ def in_words(tried: Sequence[TriedNumbers]) -> str:
 
 def _distance(numbers: Numbers, start: Numbers) -> float:
     return float(sum(np.log(numbers[name] / start[name]) ** 2 for name in start))
+
+
+class SearchedParams(NamedTuple):
+    """Outcome of a search: parameters with the best numbers, calmer ones of last resort, and all that was tried."""
+
+    params: PredictiveParams
+    calmer: PredictiveParams
+    tried: tuple[TriedNumbers, ...]
+
+
+def searched_params(
+    law_of: Callable[[PredictiveParams], ControlLaw],
+    model: Identified,
+    signals: Signals,
+    params: PredictiveParams,
+    horizon: int,
+) -> SearchedParams:
+    """The best numbers of a search that starts from ``params`` and ``horizon``.
+
+    Its set points step over the record's range, so its laws know no soft limits and no recipe. The calmer numbers are
+    ``CALM_SPEED`` of the speed and ``CALM_JUMPS`` of the jumps.
+    """
+    plain = replace(params, cv_low=None, cv_high=None, preview="held", operate=None)
+
+    def with_numbers(n: Mapping[str, float], damping: float | None, given: PredictiveParams) -> PredictiveParams:
+        numbers: dict[str, Any] = {**n, "horizon": int(n["horizon"]), "damping": damping}
+        return replace(given, **numbers)
+
+    start = {n: float(getattr(params, n)) for n in ("speed", "caution", "jumps")} | {"horizon": float(horizon)}
+    found = tuned(
+        TuningLoops.draw(model, signals, horizon, params.seed),
+        lambda n, damping: law_of(with_numbers(n, damping, plain)),
+        start,
+        params.damping,
+    )
+    at = found.numbers
+    calm = {**at, "speed": CALM_SPEED * at["speed"], "jumps": CALM_JUMPS * at["jumps"]}
+    best, calmer = (with_numbers(n, found.damping, params) for n in (at, calm))
+    return SearchedParams(best, calmer, found.tried)
