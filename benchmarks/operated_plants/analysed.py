@@ -66,8 +66,10 @@ RATES, BARRIERS, USUAL = (1 / 20, 1 / 40), (6_000.0, 9_000.0), 345.0  # 1/sample
 
 
 def _series(x: Any, u: Any, d: Any, w: Any) -> list[Any]:
-    """A -> B -> C in a stirred tank: concentrations of all three [mol/l], and the temperature [K]; ``u`` is feed [%]
-    and jacket temperature [K], ``w`` the feed's concentration and what the jacket is off."""
+    """A -> B -> C in a stirred tank: concentrations of all three [mol/l], and the temperature [K].
+
+    ``u`` is the feed [%] and the jacket's temperature [K], ``w`` the feed's concentration and what the jacket is off.
+    """
     a, b, c, hot = (x[i] for i in range(4))
     swept = 0.1 * u[0] / VOLUME
     rates = [k * ca.exp(-e * (1 / hot - 1 / USUAL)) for k, e in zip(RATES, BARRIERS, strict=True)]
@@ -81,7 +83,7 @@ def _series(x: Any, u: Any, d: Any, w: Any) -> list[Any]:
 
 SERIES = OperatedPlant(
     name="series",
-    title="Reactor A -> B -> C: B every 15 samples and 4 late, C every 40 and 12 late, one in ten and one in six missing",
+    title="Reactor A -> B -> C: B every 15 samples and 4 late, C every 40 and 12 late; one in ten, one in six missing",
     pv=(Signal("TI", "K", 320.0, 370.0), Signal("B", "mol/l", 0.0, 2.0), Signal("C", "mol/l", 0.0, 1.0)),
     sp=(Signal("TI", "K", 335.0, 355.0), Signal("B", "mol/l", 0.4, 0.7)),
     mv=(Signal("feed", "%", 10.0, 100.0, max_move=10.0), Signal("jacket", "K", 320.0, 370.0, max_move=4.0)),

@@ -7,9 +7,10 @@
 - held: the same readings, and the last one counts in every row between, as for somebody who says nothing of it.
 
 One record of 4,000 rows a seed, with noise and without loads; all ways have the same of other process variables. The
-search for a model has a quarter of a minute (``--minutes``). A model is then run free over 2,000 other rows, from rest, and its outputs are
-compared with the true ones, late as they are, without noise: rms in % of the standard deviation, after the first 200.
-``--loops`` runs the laws of these models over a day of 600 samples a seed instead: errors and travel.
+search for a model has a quarter of a minute (``--minutes``), which is less than the reactor's networks need. A model is
+then run free over 2,000 other rows, from rest, and its outputs are compared with the true ones, late as they are,
+without noise: rms in % of the standard deviation, after the first 200. ``--loops`` runs the laws of these models over a
+day of 600 samples a seed instead, with loads and noise: errors and travel. ``--table FILE ...`` prints kept figures.
 """
 
 from __future__ import annotations
@@ -199,7 +200,9 @@ def spread(values: Sequence[float]) -> str:
 
 def model_table(lines: Sequence[Mapping[str, Any]]) -> str:
     """A row for each analyser and way, and one for the other process variables."""
-    found = ["plant, output, way | free run [% of sd] | order | late | first answer | gain off [%] | 63 % off [rows] | s"]
+    found = [
+        "plant, output, way | free run [% of sd] | order | late | first answer | gain off [%] | 63 % off [rows] | s"
+    ]
     for plant in PLANTS.values():
         for i, s in enumerate(plant.pv):
             for way in WAYS:
@@ -238,7 +241,12 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--minutes", type=float, default=MINUTES, help=f"of a model's search ({MINUTES:g})")
     parser.add_argument("--loops", action="store_true", help="days of the laws instead of the models")
     parser.add_argument("--json", type=Path, help="file of the figures, one line each; they are added to it")
+    parser.add_argument("--table", type=Path, nargs="*", help="files of figures: prints their table, and runs nothing")
     options = parser.parse_args(argv)
+    if options.table:
+        kept = [json.loads(line) for file in options.table for line in file.read_text().splitlines()]
+        print(loop_table(kept) if options.loops else model_table(kept))
+        return 0
     torch.set_num_threads(1)
     fit, lines = Fit(options.rows, options.minutes, networks=True), []
     for seed in options.seeds:

@@ -12,7 +12,7 @@ from loopwright.pipeline.config.exports import ExportParams
 from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.analyser_readings import Aligned, of_samples
-from loopwright.pipeline.historian.cleaning.new_readings import new_readings, on_rows, rows_between
+from loopwright.pipeline.historian.cleaning.new_readings import missing_readings, new_readings, on_rows, rows_between
 from loopwright.pipeline.historian.cleaning.tags import Tag, named
 from loopwright.pipeline.historian.export_params import exported, read_and_screen
 from loopwright.pipeline.historian.files.export import Series
@@ -61,6 +61,16 @@ def test_a_reading_belongs_to_the_first_row_that_is_not_before_it() -> None:
     assert fresh.tolist() == [True, False, True, True, False]
     assert value.tolist() == [1.0, 1.5, 2.0, 4.0, 4.0]
     assert rows_between(np.arange(100) % 7 == 3) == 7
+
+
+def test_readings_that_lack_are_counted_and_a_jitter_of_rows_is_none() -> None:
+    rows = np.arange(0, 2_000, 20)
+    fresh = np.zeros(2_000, dtype=np.bool_)
+    fresh[np.delete(rows, [7, 30, 31, 32])] = True
+    assert missing_readings(fresh) == 4
+    late = np.zeros(2_000, dtype=np.bool_)
+    late[rows[:-1] + np.random.default_rng(0).integers(0, 5, len(rows) - 1)] = True
+    assert missing_readings(late) == 0
 
 
 @pytest.mark.parametrize("missing", [False, True])
