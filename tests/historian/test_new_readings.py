@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -88,7 +89,14 @@ def test_screening_keeps_every_row_and_knows_the_new_readings(tmp_path: Path, mi
     assert len(rows) <= np.count_nonzero(fresh) + 1  # a held value at the beginning may be one
     assert record.pv[rows, 1] == pytest.approx(read[rows, 1], rel=1e-5)
     kinds = {f.kind for f in found.report.findings}
-    assert "analyser" in kinds
+    said = [f.words for f in found.report.findings if f.kind == "analyser"]
+    assert {f.tag for f in found.report.findings if f.kind == "analyser"} == {NAMES[1]}
+    assert len(said) == 2
+    assert f"{EVERY} rows ({EVERY * PERIOD_S:g} s)" in said[0]
+    late = re.search(r"(\d+) rows? \((\d+) s\)", said[1])
+    assert late is not None
+    assert 0 < int(late[1]) <= 6
+    assert int(late[2]) == PERIOD_S * int(late[1])
     assert not kinds & {"stuck", "saturated", "gaps"}
 
 

@@ -23,7 +23,9 @@ LEAST_NEW = 30  # of an analyser: a model of its own needs some for each number
 NOT_SELDOM = 0.5  # share of the rows from which new readings are no seldom ones: then the tag is a pv like others
 STORED = 0.5  # share of the cells that hold a value from which an archive repeats the last one
 STEPS_WITHOUT = 1.5  # steps of the clock between two values: more is a time without any
-MISSED = 1.5  # usual times between two new readings: from there on the nearest whole number of them tells how many lack
+LACKS_FROM = (
+    1.5  # usual times between two new readings: from there on the nearest whole number of them tells how many lack
+)
 
 
 def new_readings(series: Series, step_s: float) -> Series:
@@ -74,7 +76,7 @@ def missing_readings(fresh: NDArray[np.bool_]) -> int:
     An archive that repeats the last number does not show one that is equal to it: it lacks, too.
     """
     times = np.diff(np.flatnonzero(fresh)) / rows_between(fresh)
-    return int(np.sum(np.rint(times[times >= MISSED]) - 1))
+    return int(np.sum(np.rint(times[times >= LACKS_FROM]) - 1))
 
 
 def put_analysers(grid: Grid, analysers: Sequence[Tag], own: Mapping[str, Series]) -> list[Finding]:
