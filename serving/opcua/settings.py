@@ -91,7 +91,7 @@ class AnalyserNode:
     """The way in which an analyser's new results are told from one that stands.
 
     ``longest_s`` is the longest time [s] without a new one. A result is ``new`` where its ``number`` is another one;
-    with ``source_time`` also where its source time is, which tells two equal results apart. That is for a server that
+    with ``source_time`` also where its source time is, which tells two equal results apart. It suits a server that
     stamps a value when it is made: one that stamps what stands anew would make each reading a result.
     """
 
