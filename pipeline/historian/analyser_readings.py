@@ -98,8 +98,8 @@ def of_lateness(found: Aligned, tags: Mapping[str, str]) -> list[Finding]:
         words = "no lateness is seen in its new readings, though slow answers can hide one"
         if late:
             words = (
-                f"its new readings come {counted(late, 'row')} ({late * found.record.period_s:g} s) after what they "
-                "measure, as the inputs' moves show; slow answers can hide some rows more"
+                f"its new readings come {counted(late, 'row')} ({late * found.record.period_s:g} s) or more after what "
+                "they measure, by the inputs' moves; slow answers can hide some rows"
             )
         findings.append(Finding("analyser", tags[signal.name], words))
     return findings
