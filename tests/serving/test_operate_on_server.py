@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from asyncua import ua
 from asyncua.sync import Server as SyncServer
+from operated_law import Given
 from plant_servers import RunningLoop, free_port
 from processes import within
 
 from loopwright.serving import Controller, Mode
+from loopwright.serving.journal import JournalReader
 from loopwright.serving.opcua.inspection import inspected
-from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.opcua.settings import AnalyserNode, Nodes, Server
 from loopwright.serving.station.settings import Bridge, Guards, JournalSettings, Settings
 
 pytest_plugins = ["small_laws", "operated_files"]
@@ -25,38 +30,43 @@ SPACE = "nsu=urn:test:plant;s="
 class PlantServer:
     """Nodes that hold what the test writes."""
 
-    def __init__(self) -> None:
+    def __init__(self, start: Mapping[str, Any]) -> None:
         self.endpoint = f"opc.tcp://127.0.0.1:{free_port()}"
         self.server = SyncServer()
         self.server.set_endpoint(self.endpoint)
         space = self.server.register_namespace("urn:test:plant")
         self.nodes = {}
-        for name, value in START.items():
+        for name, value in start.items():
             node = self.server.nodes.objects.add_variable(ua.NodeId(name, space), name, value)
             node.set_writable()
             self.nodes[name] = node
         self.server.start()
 
-    def write(self, name: str, value: Any, status: int = ua.StatusCodes.Good) -> None:
+    def write(self, name: str, value: Any, status: int = ua.StatusCodes.Good, at_s: float | None = None) -> None:
+        """A value with its status, and with a source time where one is given: seconds behind a fixed one."""
         kind = ua.VariantType.Boolean if isinstance(value, bool) else ua.VariantType.Double
-        self.nodes[name].write_value(ua.DataValue(ua.Variant(value, kind), ua.StatusCode(status)))
+        stamp = None if at_s is None else datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=at_s)
+        self.nodes[name].write_value(ua.DataValue(ua.Variant(value, kind), ua.StatusCode(status), stamp))
 
 
 @pytest.fixture
-def server() -> Iterator[PlantServer]:
-    made = PlantServer()
+def server(request: pytest.FixtureRequest) -> Iterator[PlantServer]:
+    made = PlantServer(getattr(request, "param", START))
     yield made
     RunningLoop.end_all()
     made.server.stop()
 
 
-def settings_of(server: PlantServer, controller: Controller, folder: Path, **changed: Any) -> Settings:
+def settings_of(
+    server: PlantServer, controller: Controller, folder: Path, analysers: Any = None, **changed: Any
+) -> Settings:
     groups: Any = {g: {s.name: SPACE + s.name for s in controller.manifest.signals(g)} for g in ("pv", "mv")}
-    operate = {"valve.high": f"{SPACE}high", "valve.use": f"{SPACE}use"}
+    known = {e.name for e in controller.manifest.operate}
+    operate = {n: SPACE + n.split(".")[1] for n in ("valve.high", "valve.use") if n in known}
     return Settings(
         controller.path,
         Server(server.endpoint, security="None", insecure=True, source_time="ignore"),
-        Nodes(**groups, operate=operate, lease="none"),
+        Nodes(**groups, operate=operate, lease="none", analysers=analysers or {}),
         start="AUTO",
         accept_unproven=True,
         speed=5.0,  # periods of .2 s
@@ -99,3 +109,101 @@ def test_the_check_shows_the_nodes_of_operate(server: PlantServer, operated: Con
     high, use = rows["operate valve.high"], rows["operate valve.use"]
     assert (high.wrong, high.value, use.wrong, use.note, use.value) == ("", "120", "", "", "1")
     assert "0 to 100 %" in high.note
+
+
+# ----------------------------------------------------------------------------------------------------------- analysers
+class Results:
+    """The scans of a loop at which its law got a new reading of p, and the number that it got."""
+
+    def __init__(self, running: RunningLoop, controller: Controller) -> None:
+        self.running, self.manifest = running, controller.manifest
+
+    def found(self) -> list[float]:
+        given = [Given.of(self.manifest, c.info) for c in self.running.commands if c.info is not None]
+        assert all(g.fresh["T"] == 1 for g in given)
+        return [g.pv["p"] for g in given if g.fresh["p"]]
+
+    def after(self, scans: int = 4) -> list[float]:
+        """Those until so many scans from now."""
+        enough = len(self.running.commands) + scans
+        assert within(20, lambda: len(self.running.commands) >= enough)
+        return self.found()
+
+
+@pytest.mark.parametrize("new", ["number", "source_time"])
+def test_a_law_gets_each_result_of_an_analyser_once(
+    server: PlantServer, operated: Controller, tmp_path: Path, new: Any
+) -> None:
+    server.write("p", 5.0, at_s=0)
+    of = {"p": AnalyserNode(1_000.0, new)}
+    running = RunningLoop(settings_of(server, operated, tmp_path, analysers=of))
+    running.becomes(Mode.AUTO, scans=3)
+    results = Results(running, operated)
+    stamped = new == "source_time"
+    assert results.after() == [5.0]
+    server.write("p", 5.5, at_s=60)
+    assert results.after() == [5.0, 5.5]
+    server.write("p", 5.5, at_s=120)  # two equal results, or a server that stamps what stands
+    expected = [5.0, 5.5, *[5.5] * stamped]
+    assert results.after() == expected
+    server.write("p", 6.0, ua.StatusCodes.BadSensorFailure, at_s=180)
+    assert results.after() == expected
+    server.write("p", 5.5, at_s=120)  # the last good one stands there again
+    assert results.after() == expected
+    server.write("p", 6.0, at_s=180)  # good in the end
+    assert results.after() == [*expected, 6.0]
+    assert not any(c.bridged or c.shed or c.fault for c in running.since(0, Mode.AUTO))
+    running.end()
+
+
+def test_an_analyser_that_has_no_result_for_too_long_is_left_out_and_comes_back(
+    server: PlantServer, operated: Controller, tmp_path: Path
+) -> None:
+    limits = {"analysers": {"p": 8.0}, "fresh": Bridge(3.0)}  # 8 and 3 scans
+    running = RunningLoop(settings_of(server, operated, tmp_path, **limits))
+    running.becomes(Mode.AUTO, scans=1)
+    assert within(20, lambda: list(running.commands[-1].shed) == ["p"])
+    given = [Given.of(operated.manifest, c.info) for c in running.commands if c.info is not None]
+    assert given[-1].operate["p.use"] == 0.0
+    assert given[-1].fresh == {"T": 1.0, "p": 0.0, "x": 1.0}
+    first = next(i for i, c in enumerate(running.commands) if c.bridged)
+    assert "no new reading" in running.commands[first].bridged["p"]
+    assert running.commands[-1].mode is Mode.AUTO
+    with closing(JournalReader(running.settings.journal.file)) as reader:
+        assert within(20, lambda: [e.event.alarm for e in reader.active()] == ["reading p"])
+    server.write("T", 299.0)  # the other variable is controlled meanwhile
+    before = running.commands[-1].mv[0]
+    assert within(20, lambda: running.commands[-1].mv[0] > before)
+    server.write("T", 300.0)
+    server.write("p", 5.1)
+    assert within(20, lambda: not running.commands[-1].shed)
+    with closing(JournalReader(running.settings.journal.file)) as reader:
+        assert within(20, lambda: not reader.active())
+    said = [line for line in running.events() if "PV p" in line]
+    assert ["is bridged" in said[0], "is left out" in said[1], "is read again" in said[2]] == [True] * 3
+    counts = running.station.watching.weekly.counts
+    assert counts["cv p shed"] > 0
+    assert counts["cv p bridged"] >= 1
+    running.end()
+
+
+@pytest.mark.parametrize("server", [{"y0": 0.4, "y1": -0.2, "u0": 0.1, "u1": 0.3}], indirect=True)
+def test_an_analyser_comes_back_without_a_bump(server: PlantServer, predictive: Controller, tmp_path: Path) -> None:
+    """A plant at rest: whatever moves an MV is the law's."""
+    server.write("y1", -0.2, at_s=0)
+    limits = {"analysers": {"y1": AnalyserNode(5.0, "source_time")}, "fresh": Bridge(2.0)}
+    running = RunningLoop(settings_of(server, predictive, tmp_path, **limits))
+    running.becomes(Mode.AUTO, scans=1)
+    assert within(20, lambda: list(running.commands[-1].shed) == ["y1"])
+    server.write("y1", -0.2, at_s=60)
+    assert within(20, lambda: not running.commands[-1].shed)
+    enough = len(running.commands) + 3
+    assert within(20, lambda: len(running.commands) >= enough)
+    seen = running.since(0, Mode.AUTO)
+    mv = np.array([c.mv for c in seen])
+    left_out = next(i for i, c in enumerate(seen) if c.shed)
+    assert np.abs(mv - [0.1, 0.3]).max() < 1e-3  # a plan from a cold start settles
+    assert np.abs(np.diff(mv[left_out - 1 :], axis=0)).max() < 1e-5  # of a range of 2
+    server.write("y1", -0.1, at_s=120)  # off its set point: the law is there
+    assert within(20, lambda: bool(np.abs(running.commands[-1].mv - [0.1, 0.3]).max() > 1e-3))
+    running.end()
