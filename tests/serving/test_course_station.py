@@ -23,7 +23,7 @@ from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.requests import Request, change
 from loopwright.serving.station.settings import JournalSettings, Settings
 from loopwright.serving.station.station import Station
-from loopwright.serving.station.views import about, state
+from loopwright.serving.station.views import about, courses, state
 
 pytest_plugins = ["small_laws", "operated_files", "course_files"]
 SERVER = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
@@ -107,7 +107,10 @@ def test_a_course_is_followed_written_down_and_shown(made: Station) -> None:
         "change loop: the course of d0 is over ()",
     ]
     shown = state(made)["courses"]
-    assert shown == {"y1": {"ends_in_s": 43.0, "at": 1.0}}
+    assert shown == {"y1": {"ends_in_s": 43.0, "at": 1.0, "who": "anna", "number": 3}}
+    assert courses(made)["courses"] == [
+        {"signal": "y1", "straight": False, "points": [(0.0, 1.0)], "who": "anna", "number": 3}
+    ]
     assert about(made)["ahead"]["horizon"] == 12
 
 
