@@ -1,4 +1,4 @@
-"""Courses that stood when a loop last ended: kept in the journal by the clock, said at the next start, and taken back."""
+"""Courses that stood when a loop last ended: kept in its journal by the clock, told at its next start, taken back."""
 
 from __future__ import annotations
 

@@ -7,60 +7,24 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from fake_loop import FakeLoop
+from still_station import StillPlant, settings_of
 
 from loopwright.pipeline.__main__ import main
 from loopwright.serving import Controller, LoopError, Sample, VirtualClock
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command
-from loopwright.serving.opcua.sampling import Values
-from loopwright.serving.opcua.settings import Nodes, Server
 from loopwright.serving.station import station
 from loopwright.serving.station.build_loop import control_loop
 from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.requests import Request, change
-from loopwright.serving.station.settings import JournalSettings, Settings
+from loopwright.serving.station.settings import JournalSettings
 from loopwright.serving.station.station import Station
 from loopwright.serving.station.views import about, courses, state
 
 pytest_plugins = ["small_laws", "operated_files", "course_files"]
-SERVER = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
 COURSE = {"points": {"y0": [[2, 0.5]], "d0": [[0, 0.0], [3, 0.2]], "y1": [[50, 1.0]]}}
-
-
-def settings_of(controller: Controller, **changed: Any) -> Settings:
-    m = controller.manifest
-    nodes = {g: {s.name: f"ns=2;s={s.name}" for s in m.signals(g)} for g in ("pv", "dv", "mv")}
-    return Settings(controller.path, SERVER, Nodes(**nodes), start="MANUAL", **changed)
-
-
-class StillPlant:
-    """In the place of the endpoint: it stands still and reads back what was written."""
-
-    def __init__(self, *_: Any, **__: Any) -> None:
-        self.trouble, self.connections, self.connected = "", 1, True
-        self.mv, self.asked_sp = np.zeros(2), dict[str, float]()
-
-    @property
-    def values(self) -> Values:
-        return Values(0.0, np.zeros(2), self.mv, np.zeros(1), 0.0, "", (), asked_sp=self.asked_sp)
-
-    def start(self) -> None:
-        """Nothing: it is there."""
-
-    def serve(self, law: Any) -> None:
-        """Nothing."""
-
-    def close(self) -> None:
-        """Nothing."""
-
-    def read(self) -> Sample:
-        return Sample(np.zeros(2), self.mv, dv=np.zeros(1))
-
-    def write(self, mv: np.ndarray) -> None:
-        self.mv = mv.copy()
 
 
 @pytest.fixture
