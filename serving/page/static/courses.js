@@ -53,23 +53,23 @@ const speed = () => about.speed || 1;
 const ends = ({ ends_in_s }) => state.time + (about.period_s + ends_in_s) / speed(); // since 1970
 
 // [time since 1970, value] of a signal's course from now on; empty without one.
-function toCome(name) {
+function toCome(name, now = state?.time) {
   const stands = state?.courses?.[name];
   const known = points.get(name);
   if (!stands || known?.number !== stands.number) return [];
   const end = ends(stands);
   const all = known.points.map(([t, v]) => [end + t / speed(), v]);
-  const next = all.findIndex(([t]) => t > state.time);
+  const next = all.findIndex(([t]) => t > now);
   if (next < 0) return [];
-  return [[state.time, present(name, all[next - 1], all[next])], ...all.slice(next)];
+  return [[now, present(name, now, all[next - 1], all[next])], ...all.slice(next)];
 }
 
 // Its value now: between the points around it where it runs straight, else as it stands.
-function present(name, before, after) {
+function present(name, now, before, after) {
   const group = isDv(name) ? "dv" : "sp";
   const stands = state[group]?.[about.signals[group].findIndex((s) => s.name === name)] ?? after[1];
   if (!before || (group === "sp" && !points.get(name).straight)) return stands;
-  return after[0] > before[0] ? before[1] + ((after[1] - before[1]) * (state.time - before[0])) / (after[0] - before[0]) : after[1];
+  return after[0] > before[0] ? before[1] + ((after[1] - before[1]) * (now - before[0])) / (after[0] - before[0]) : after[1];
 }
 
 // ------------------------------------------------------------------------------------------------------ in the trends
@@ -88,7 +88,8 @@ export function near(signal, low, high, to) {
 
 // Over the lines of a plot: steps, or straight lines, with a mark at each point. `after`: a word that stands there.
 export function draw(u, signal, after, color) {
-  const found = about ? toCome(signal.name) : [];
+  const newest = Math.max(state?.time || 0, u.data[0].at(-1) || 0); // scans come in between two states
+  const found = about ? toCome(signal.name, newest) : [];
   const { ctx, bbox } = u;
   const right = bbox.left + bbox.width;
   const x = (t) => u.valToPos(t, "x", true);
@@ -120,7 +121,7 @@ export function draw(u, signal, after, color) {
   ctx.restore();
 }
 
-// The word "course" right of the line of now, where there is room for it.
+// The word "course" right of the line of now, where there is room for it; a prediction has drawn that line already.
 function word(u, now, after, ink) {
   const { ctx, bbox } = u;
   const begin = u.valToPos(now, "x", true);
@@ -130,6 +131,7 @@ function word(u, now, after, ink) {
   const said = after ? ", course" : "course";
   const at = begin + BEFORE * devicePixelRatio + ctx.measureText(after).width;
   if (at + ctx.measureText(said).width < bbox.left + bbox.width) ctx.fillText(said, at, bbox.top - 5 * devicePixelRatio);
+  if (after) return;
   ctx.lineWidth = devicePixelRatio;
   ctx.beginPath();
   ctx.moveTo(begin, bbox.top);
