@@ -125,7 +125,7 @@ class LastCourses:
 def _restorable(kept: LastCourses, now_s: float) -> str:
     """The way to have them; none where all are over."""
     over = all(course.over(now_s) for course in kept.by_signal.values())
-    return "" if over else "restore = true in loop.toml takes them"
+    return "" if over else "with restore = true in loop.toml a start takes them back"
 
 
 LATEST_S = 253_402_300_799.0  # since 1970, the end of the year 9999: a later time cannot be written as a date

@@ -23,7 +23,7 @@ const labelled = (words, field) => element("label", {}, `${words} `, field);
 const wrongLine = (name) => element("span", { class: "wrong", id: `wrong-${name}` });
 
 // ----------------------------------------------------------------------------------------------------------- by hand
-export function byHand(about, state) {
+export function byHand(about) {
   const speed = about.speed || 1;
   const { sp, dv } = about.signals;
   const signal = element("select", { id: "course-signal" }, ...[...sp, ...dv].map((s) => option(s.name, dv.includes(s) ? `${s.name}, forecast` : s.name)));

@@ -18,8 +18,8 @@ export function describe(found) {
   about = found;
   points = new Map();
   laid = "";
-  $("courses").hidden = !about.ahead;
-  $("course-by-hand").onclick = () => byHand(about, state);
+  for (const id of ["course-by-hand", "course-by-file"]) $(id).hidden = !about.ahead; // a law may leave a course behind
+  $("course-by-hand").onclick = () => byHand(about);
   $("course-by-file").onclick = () => byFile(about);
 }
 
@@ -28,7 +28,7 @@ export const show = (found) => {
   list();
 };
 
-const standing = () => (about?.ahead ? Object.entries(state?.courses || {}) : []);
+const standing = () => (about ? Object.entries(state?.courses || {}) : []);
 const signalOf = (name) => [...about.signals.sp, ...about.signals.dv].find((s) => s.name === name);
 const isDv = (name) => about.signals.dv.some((s) => s.name === name);
 
@@ -86,7 +86,7 @@ export function near(signal, low, high, to) {
   return [Math.min(low, ...values), Math.max(high, ...values)];
 }
 
-// Over the lines of a plot: steps, or straight lines, with a mark at each point. `after`: a word that stands there.
+// Over the lines of a plot: steps, or straight lines, with a mark at each point. `after`: the end of a word that stands above.
 export function draw(u, signal, after, color) {
   const newest = Math.max(state?.time || 0, u.data[0].at(-1) || 0); // scans come in between two states
   const found = about ? toCome(signal.name, newest) : [];
@@ -129,7 +129,7 @@ function word(u, now, after, ink) {
   ctx.textAlign = "left";
   ctx.fillStyle = ctx.strokeStyle = ink;
   const said = after ? ", course" : "course";
-  const at = begin + BEFORE * devicePixelRatio + ctx.measureText(after).width;
+  const at = after || begin + BEFORE * devicePixelRatio;
   if (at + ctx.measureText(said).width < bbox.left + bbox.width) ctx.fillText(said, at, bbox.top - 5 * devicePixelRatio);
   if (after) return;
   ctx.lineWidth = devicePixelRatio;
@@ -143,6 +143,7 @@ function word(u, now, after, ink) {
 function list() {
   if (!about) return;
   const found = standing();
+  $("courses").hidden = !about.ahead && !found.length;
   const layout = JSON.stringify(found.map(([name, { number, who, at }]) => [name, number, who, at, points.get(name)?.number]));
   if (layout !== laid) {
     const held = document.activeElement?.closest("#course-list [data-course-of]")?.dataset.courseOf;

@@ -73,14 +73,14 @@ export function near(signal, low, high) {
 
 const WORD = "prediction";
 
-// Over the lines of a plot: the course, dashed, right of now; the word that names it, or an empty one where there is none.
+// Over the lines of a plot: the course, dashed, right of now. Where the word that names it ends; 0 where there is none.
 export function draw(u, signal, kind, color) {
   const c = course(signal);
   const { ctx, bbox } = u;
   const begin = found ? u.valToPos(found.time, "x", true) : Infinity;
   const shown = c && begin < bbox.left + bbox.width - 2;
   u.root.parentElement?.setAttribute("data-ahead", shown ? c.values.length : 0); // for tests, which cannot read a canvas
-  if (!shown) return "";
+  if (!shown) return 0;
   ctx.save();
   ctx.beginPath();
   ctx.rect(bbox.left, 0, bbox.width, bbox.top + bbox.height);
@@ -91,6 +91,7 @@ export function draw(u, signal, kind, color) {
   ctx.lineWidth = devicePixelRatio;
   ctx.setLineDash([]); // uPlot leaves what its last line needed
   ctx.fillText(WORD, begin + 4 * devicePixelRatio, bbox.top - 5 * devicePixelRatio);
+  const end = begin + 4 * devicePixelRatio + ctx.measureText(WORD).width;
   ctx.beginPath();
   ctx.moveTo(begin, bbox.top);
   ctx.lineTo(begin, bbox.top + bbox.height);
@@ -110,7 +111,7 @@ export function draw(u, signal, kind, color) {
   if (c.group === "mv") ctx.lineTo(bbox.left + bbox.width, before);
   ctx.stroke();
   ctx.restore();
-  return WORD;
+  return end;
 }
 
 // ------------------------------------------------------------------------------------------- before a change is set
