@@ -134,7 +134,7 @@ def _ask(options: argparse.Namespace) -> int:
         value = dict(_pair(text) for text in options.values)
     elif do == "course":
         value = (
-            {"points": read_courses(options.courses, time.time()), "straight": options.straight}
+            {"points": read_courses(options.courses, time.time(), settings.speed), "straight": options.straight}
             if options.courses
             else ({"end": options.end} if options.end else None)
         )
