@@ -144,7 +144,7 @@ def draw(
 ) -> None:
     """Controlled variables with their set points, MVs, events and modes; PipelineError where it cannot be written.
 
-    Of a law with ``operate`` ranges and operators' limits as bands, resting values, and what is out of use.
+    It shows ranges and operators' limits as bands, resting values, and what is out of use, of a law with ``operate``.
     """
     figure = drawn(plant, history, title, marks)
     _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=dpi))
