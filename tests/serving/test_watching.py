@@ -17,6 +17,7 @@ from loopwright.serving import Command, Controller, Mode
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.monitor import Monitor, Verdict
 from loopwright.serving.monitor.weekly import WeeklyCounts
+from loopwright.serving.station.last_courses import LastCourses
 from loopwright.serving.station.last_run import Steered
 from loopwright.serving.station.recorder import MonitorRunner, Recorder
 from loopwright.serving.station.station import Station
@@ -105,9 +106,11 @@ def station_that(did: list[str], write: Callable[..., object]) -> Station:
     return cast(Station, SimpleNamespace(
         loop=SimpleNamespace(
             controller=controller, successor=None, replaced=None, operate=(), stepped=None, wishes={},
-            sp=np.zeros(len(controller.manifest.sp)), courses=SimpleNamespace(ends={}, finished=()),
+            sp=np.zeros(len(controller.manifest.sp)), manifest=controller.manifest,
+            courses=SimpleNamespace(ends={}, finished=(), now_s=0.0, standing={}),
         ),
-        _steered=Steered(), journal=SimpleNamespace(keep=lambda *_: None),
+        _steered=Steered(), _courses=LastCourses(), settings=SimpleNamespace(speed=1.0),
+        journal=SimpleNamespace(keep=lambda *_: None),
         _moved=lambda loop: None,
         scans=0, _faults=0, _missed_periods=0, _watchers=[lambda *_: did.append("others")], snapshot=None,
         recorder=SimpleNamespace(controller=controller, scan=write),
