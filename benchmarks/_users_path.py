@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +12,11 @@ from typing import Any
 
 import numpy as np
 from _free_run import Part, Predictor
+from _project import fresh_project, run_module
 
 from loopwright.pipeline.models import load_model
 from loopwright.pipeline.models.identified.dynamics import Dynamics
 from loopwright.pipeline.models.identified.identified import Identified
-
-ROOT = Path(__file__).parents[1]
-PROJECT = ("dvc.yaml", ".dvcignore", ".gitignore", ".dvc/config", ".dvc/.gitignore")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +33,7 @@ class Project:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        (folder / ".dvc").mkdir(parents=True)
-        for package in ("pipeline", "serving"):
-            shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
-        shutil.copytree(ROOT / "tools" / "roots", folder / "tools" / "roots", symlinks=True)
-        for name in PROJECT:
-            shutil.copy(ROOT / name, folder / name)
-        subprocess.run(["git", "init", "--quiet"], check=True, cwd=folder)
-        (folder / "params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
+        fresh_project(folder)
 
     def new(self, name: str, learn: Part, period_s: float, *, keep: bool = False, anyway: bool = False) -> Answer:
         """`loopwright new` of the rows to learn; ``keep``: y ends where the plant does, said in the table of tags.
@@ -98,19 +86,11 @@ class Project:
         path.write_text(section)
 
     def _run(self, module: str, *words: str) -> tuple[int, list[str]]:
-        """Exit status of a command of the product and the lines that it printed."""
-        own = {
-            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-            "PYTHONPATH": str(self.folder / "tools/roots"),
-        }
-        done = subprocess.run(
-            [sys.executable, "-m", module, *words],
-            cwd=self.folder, env={**os.environ, **own}, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        )  # fmt: skip
-        lines = [f"$ python -m {module} {' '.join(words)}", *done.stdout.splitlines()]
+        """Exit status of a command of the product and the lines that it printed, which are kept."""
+        code, lines = run_module(self.folder, module, *words)
         with (self.folder / "said.txt").open("a", encoding="utf-8") as log:
             log.write("\n".join([*lines, ""]))
-        return done.returncode, lines
+        return code, lines
 
 
 def predictor_of(model: Identified, structure: Mapping[str, Any]) -> Predictor:

@@ -17,7 +17,8 @@ from __future__ import annotations
 class LoopwrightError(Exception):
     """Base of every error that Loopwright raises on purpose; its text is one line for a person.
 
-    ``entry`` names the entry of ``operate`` that is wrong; empty where it is none.
+    ``entry`` names the entry of ``operate`` that is wrong, or of a course the signal and the place of its point, as
+    TIC-1.2; empty where it is none.
     """
 
     entry = ""

@@ -236,15 +236,15 @@ class ControlLoop:
         """The courses of set points and measured disturbances; ``set_course`` gives some, and its ``end`` ends them."""
         return self._active.courses
 
-    def set_course(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> None:
+    def set_course(self, points: Mapping[str, Points], straight: Collection[str] = (), who: str = "") -> None:
         """Give known set points and forecasts of measured disturbances, by name, as points (time [s], value).
 
         Times count from the next scan on. Set points and the law follow them in every mode, see ``Courses``; ``set_sp``
-        ends the course of a set point. LoopError for a law that does not read ``ahead``, and for points that cannot be;
-        then nothing is changed.
+        ends the course of a set point. ``who`` gave it is kept beside it. LoopError for a law that does not read
+        ``ahead``, and for points that cannot be; then nothing is changed.
         """
         self.require_course(points, straight)
-        self.courses.give(points, straight)
+        self.courses.give(points, straight, who)
 
     def require_course(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> None:
         """LoopError where ``set_course`` would refuse."""

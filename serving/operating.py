@@ -23,6 +23,12 @@ def allowed(entry: OperateEntry) -> str:
     return "0 or 1" if entry.what in SWITCHES else f"{entry.low:g} to {entry.high:g} {entry.unit}".rstrip()
 
 
+def written(text: str) -> float:
+    """A value as somebody writes it: a number, or true or false for a switch; ValueError for anything else."""
+    return SWITCH_WORDS[text.lower()] if text.lower() in SWITCH_WORDS else float(text)
+
+
+SWITCH_WORDS = {"true": True, "false": False}
 SWITCHED_ON = 0.85  # of drawn switches: with half of them off laws would mostly stand still
 
 

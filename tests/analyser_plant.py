@@ -10,19 +10,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from benchmark_modules import FOLDER, benchmark_modules
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+_COLUMN = benchmark_modules(("operated_plant", "analysed"), FOLDER / "operated_plants").analysed  # has its numbers
 PERIOD_S = 60.0
-EVERY, LATE = 20, 5  # rows
-GAIN = np.array([[0.50, -0.20], [0.030, 0.045], [0.010, 0.025]])  # of TI [degC], AI [%], PI [bar], to two valves [%]
-LAG = np.array([[12.0, 16.0], [20.0, 14.0], [6.0, 8.0]])  # rows
-MIDDLE = np.array([120.0, 4.0, 2.5])  # at 50 % and 50 %
-NOISE = np.array([0.15, 0.02, 0.008])
+EVERY, LATE, FAST = _COLUMN.EVERY, _COLUMN.LATE, _COLUMN.FAST
+GAIN, LAG, MIDDLE, NOISE = _COLUMN.GAIN, _COLUMN.LAG, _COLUMN.MIDDLE, _COLUMN.NOISE
 NAMES = ("TI-1.PV", "AI-1.PV", "PI-1.PV", "FV-1.OP", "FV-2.OP")
 UNITS = ("degC", "%", "bar", "%", "%")
-FAST = 0.3  # of the second lag, over the first
 
 
 def moves(rows: int, rng: np.random.Generator) -> Array:

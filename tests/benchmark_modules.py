@@ -31,11 +31,13 @@ def own_plants_modules(names: Sequence[str]) -> SimpleNamespace:
 
 
 def benchmark_modules(names: Sequence[str], folder: Path = FOLDER) -> SimpleNamespace:
-    """Modules of a folder of scripts by name; their short names are free again afterwards."""
+    """Modules of a folder of scripts by name, beside what all benchmarks share; their names are free again then."""
+    before = list(sys.path)
     sys.path.insert(0, str(folder))
+    sys.path.append(str(FOLDER))
     try:
         return SimpleNamespace(**{name: importlib.import_module(name) for name in names})
     finally:
-        sys.path.remove(str(folder))
+        sys.path[:] = before
         for name in names:
             sys.modules.pop(name, None)

@@ -15,6 +15,12 @@ with all PVs within their ranges; ``beyond``: what lies outside, in % of a range
 hour by the costs of ``operate``; ``of NMPC``: in % of the NMPC's, of costs 100 % less what is spent
 beyond the NMPC's. ``travel``: % of the MVs' ranges a sample; ``rest``: % of them that MVs with a rest are off it.
 
+``--run``: ours as users come by it. The record as a file, in which an analyser's last number stands until the next,
+and a table of tags (roles, ranges, rests, costs) go through `loopwright new` and `loopwright run` on one core, with all
+defaults and gates, and the shipped file steps the same days, beside the NMPC. What came is kept in the folder for
+temporary files until the product's code or the plant changes. A plant that is refused, or that ships no predictive
+file, is a row that says so. Half an hour of one core a plant.
+
 ``--operating``: priorities where ranges are at odds, and bumps of changes, on the files of three plants instead.
 ``--json FILE`` keeps the figures, ``--picture FILE`` draws the first day of the first plant.
 """
@@ -25,6 +31,8 @@ import argparse
 import sys
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
+
 import torch
 from contest import HEAD, SCORED, as_json, contested, rows_of
 from from_record import Fit
@@ -33,6 +41,7 @@ from mixing import BLENDER, TANK
 from moving import PUMPS, REACTOR
 from operated_plant import DAY
 from separating import COLUMN, EVAPORATOR
+from users_run import users_main
 
 from loopwright.pipeline.files import write_bytes
 
@@ -51,6 +60,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--json", type=Path, help="file of the figures, one line a plant")
     parser.add_argument("--picture", type=Path, help="file of a picture of the first plant's first day")
     parser.add_argument("--operating", action="store_true", help="priorities and bumps instead")
+    parser.add_argument("--run", action="store_true", help="ours through `new` and `run` instead, beside the NMPC")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     fit = Fit(options.rows, options.minutes, options.networks)
@@ -61,6 +71,8 @@ def main(argv: list[str]) -> int:
         for name in options.plants or ("column", "furnace", "reactor"):
             print(operating_rows(PLANTS[name], fit), flush=True)
         return 0
+    if options.run:
+        return users_main([PLANTS[n] for n in names], fit, options.seeds, options.samples, options.json)
     print(HEAD)
     lines = []
     for i, name in enumerate(names):

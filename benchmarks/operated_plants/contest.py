@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 
+import figures as figures_module
 import numpy as np
+import perfect_economic
 from figures import DayController, Figures, Run, figures_of, run_day
 from from_record import FOLDER, Fit, Served, controller_of, law_of
 from operated_plant import DAY, OperatedPlant
@@ -112,6 +115,20 @@ def contested(
     if perfect.failures:
         say(f"  {plant.name}: IPOPT found no plan at {perfect.failures} samples; the last plan went on")
     return Contest(plant, figures, first, dict(zip(plant.settings, settings, strict=True)), seconds)
+
+
+def bound_of(plant: OperatedPlant, fit: Fit, seeds: Sequence[int], samples: int) -> Figures:
+    """The NMPC's figures alone, kept in a file; the record and the law's numbers give its scales alone."""
+    code = [inspect.getsource(module) for module in (perfect_economic, figures_module)]
+    known = [plant.name, dict(plant.operate), _digest(plant), fit.rows, list(seeds), samples, *code]
+    path = FOLDER / f"{plant.name}-nmpc-{hashlib.sha256(json.dumps(known).encode()).hexdigest()[:12]}.json"
+    if not path.exists():
+        model, _ = fit.model(plant)
+        perfect = PerfectEconomic(plant, law_of(plant, model, tuning="given"), model)
+        days = [plant.day(seed, samples) for seed in seeds]
+        runs = [run_day(plant, (perfect.reset(), perfect)[1], day) for day in days]
+        write_bytes(path, json.dumps(asdict(figures_of(plant, days, runs))).encode())
+    return Figures(**json.loads(path.read_text()))
 
 
 HEAD = (

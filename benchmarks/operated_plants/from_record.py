@@ -6,9 +6,10 @@ import hashlib
 import pickle
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from operated_plant import OperatedPlant
@@ -27,7 +28,8 @@ from loopwright.serving import Controller
 from loopwright.serving.operating import Operate
 
 FOLDER = Path(tempfile.gettempdir()) / "loopwright_operated_plants"
-CODE = Path(__file__).parents[2] / "pipeline" / "models"
+PIPELINE = Path(__file__).parents[2] / "pipeline"
+CODE = (*(PIPELINE / "models").rglob("*.py"), PIPELINE / "historian" / "analyser_readings.py")
 ROWS = 8_000
 
 
@@ -71,22 +73,27 @@ class Fit:
     networks: bool = False
 
     def model(self, plant: OperatedPlant) -> tuple[Identified, float]:
-        """The model of all PVs, its other numbers by default, and the processor time [s] that it took.
+        """The model of all PVs, its other numbers by default, and the processor time [s] that it took."""
+        model, _, seconds = self.learnt(plant, record_of(plant, self.rows))
+        return model, seconds
 
-        A file keeps it, named after the record and the code of the models: a change of either fits again.
+    def learnt(self, plant: OperatedPlant, record: Record) -> tuple[Identified, Mapping[str, Any], float]:
+        """The model of all PVs of a record, what its search says of it, and the processor time [s] that it took.
+
+        A file keeps them, named after the record and the code of the models: a change of either fits again.
         """
-        record, code = record_of(plant, self.rows), hashlib.sha256()
-        for file in sorted(CODE.rglob("*.py")):
+        code = hashlib.sha256()
+        for file in sorted(CODE):
             code.update(file.read_bytes())
         how = f"{self.minutes or 'default'}{'-networks' if self.networks else ''}"
-        path = FOLDER / f"{plant.name}-{how}-{record.digest()[:12]}-{code.hexdigest()[:12]}.pickle"
+        path = FOLDER / f"{plant.name}-{how}-{record.digest()[:12]}-{code.hexdigest()[:12]}.learnt"
         if not path.exists():
             began = time.process_time()
             units = UNITS if self.networks else ()
             part = IdentifiedPart(outputs="measured", minutes=self.minutes, units=units)
             learnt = part.learn(Source(record, plant.signals))
-            write_bytes(path, pickle.dumps((learnt.model, time.process_time() - began)))
-        found: tuple[Identified, float] = pickle.loads(path.read_bytes())
+            write_bytes(path, pickle.dumps((learnt.model, learnt.metrics, time.process_time() - began)))
+        found: tuple[Identified, Mapping[str, Any], float] = pickle.loads(path.read_bytes())
         return found
 
 

@@ -120,8 +120,9 @@ class OperatedPlant:
     """A plant whose derivatives are a sample's; the first PVs are those with set points.
 
     ``rhs(x, mv, dv, w)`` -> dx/dt [1/sample], ``output(x)`` -> the PVs. ``late`` and ``every``: PV -> samples by which
-    an analyser is late, and between its readings. ``operate``: what operators have set. ``moves``: spans of the MVs
-    in the record. Set points and measured disturbances go by ``sp_steps`` and ``dv_steps``.
+    an analyser is late, and between its readings; ``missing``: PV -> share of these that it does not give. ``operate``:
+    what operators have set. ``moves``: spans of the MVs in the record. Set points and measured disturbances go by
+    ``sp_steps`` and ``dv_steps``.
     """
 
     name: str
@@ -146,6 +147,7 @@ class OperatedPlant:
     hold: tuple[int, int] = (6, 40)  # samples of a move in the record
     late: Mapping[int, int] = field(default_factory=dict)
     every: Mapping[int, int] = field(default_factory=dict)
+    missing: Mapping[int, float] = field(default_factory=dict)
 
     @property
     def signals(self) -> Signals:
@@ -259,10 +261,16 @@ class OperatedPlant:
             for of in (self.sp_steps, self.dv_steps, self.wanders)
         )
         noise = np.array(self.noise) * rng.standard_normal((samples, len(self.pv)))
+        return Day(sp, dv, w, noise, self.fresh(samples, rng))
+
+    def fresh(self, samples: int, rng: np.random.Generator) -> Array:
+        """Whether each PV has a new reading, (samples, n_pv): 1 or 0; the first sample has all."""
         fresh = np.ones((samples, len(self.pv)))
         for pv, every in self.every.items():
             fresh[:, pv] = np.arange(samples) % every == 0
-        return Day(sp, dv, w, noise, fresh)
+            if self.missing.get(pv):
+                fresh[1:, pv] *= rng.random(samples - 1) >= self.missing[pv]
+        return fresh
 
     def range_of(self, pv: int) -> tuple[float, float]:
         """The range in which operators want a PV."""

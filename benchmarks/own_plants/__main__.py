@@ -28,6 +28,9 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1]))  # what all benchmarks share
 
 import numpy as np
 import torch

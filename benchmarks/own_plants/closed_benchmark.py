@@ -22,9 +22,10 @@ import closed_record
 import loops
 import plant as plant_module
 import torch
+from _project import withheld
 from closed_development import CLOSED_DEVELOPMENT
 from closed_plant import ClosedPlant, closed_tests_of
-from closed_product import Delivered, by_fit, by_run, columns_of, withheld
+from closed_product import Delivered, by_fit, by_run, columns_of
 from closed_record import OldLaw, closed_record_of, write_export
 from closed_untouched import CLOSED_UNTOUCHED
 from loops import Steps, closed, scores

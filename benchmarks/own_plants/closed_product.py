@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import os
-import resource
-import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from _project import new_and_run
 from closed_plant import ClosedPlant
 from closed_record import roles
 from loops import Steps
@@ -23,9 +18,6 @@ from torch import Tensor
 from loopwright.pipeline.workbench import PlantData, design, identify, screen
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import OutputError
-
-ROOT = Path(__file__).parents[2]
-PROJECT = ("dvc.yaml", ".dvcignore", ".gitignore", ".dvc/config", ".dvc/.gitignore")
 
 
 class Paced:
@@ -122,20 +114,9 @@ def columns_of(plant: ClosedPlant) -> Columns:
 
 def by_run(plant: OwnPlant, file: Path, project: Path, columns: Columns) -> Delivered:
     """`loopwright new` and `loopwright run` in a fresh project, and the files that are shipped there."""
-    _fresh(project)
-    began = resource.getrusage(resource.RUSAGE_CHILDREN)
-    shutil.copy(file, project / file.name)
-    code, said = _loopwright(project, "new", plant.name, file.name, *columns.options)
-    if code == 0:
-        code, more = _loopwright(project, "run", plant.name)
-        said += more
-    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
-    seconds = ended.ru_utime + ended.ru_stime - began.ru_utime - began.ru_stime
-    for package in ("pipeline", "serving"):  # runs of many states of the sources are kept side by side
-        shutil.rmtree(project / package)
-    files = {path.stem: path for path in sorted((project / "artifacts" / plant.name).glob("*.onnx"))}
-    (project / "said.txt").write_text("\n".join(said), encoding="utf-8")
-    return Delivered({name: shipped(plant, path, columns) for name, path in files.items()}, said, seconds, files)
+    done = new_and_run(project, plant.name, [file], columns.options)
+    laws = {name: shipped(plant, path, columns) for name, path in done.files.items()}
+    return Delivered(laws, done.said, done.seconds, done.files)
 
 
 def shipped(plant: OwnPlant, file: Path, columns: Columns) -> Steps:
@@ -146,38 +127,3 @@ def shipped(plant: OwnPlant, file: Path, columns: Columns) -> Steps:
         found = [s.name for s in manifest.signals(role)]
         assert found == list(names), f"{file}: {role} is {found}, not {names}"
     return paced(plant, law, manifest.period_s)
-
-
-def withheld(project: Path, name: str) -> list[str]:
-    """Why a controller of a finished run is not shipped, a line each."""
-    why = []
-    for path in sorted((project / "work" / name / "controllers").glob("*/metrics.json")):
-        text = json.loads(path.read_text()).get("withheld")
-        why += [f"{path.parent.name}: {text}"] if text else []
-    return why
-
-
-def _fresh(project: Path) -> None:
-    """A project of nothing but the product's sources."""
-    shutil.rmtree(project, ignore_errors=True)
-    (project / ".dvc").mkdir(parents=True)
-    for package in ("pipeline", "serving"):
-        shutil.copytree(ROOT / package, project / package)
-    shutil.copytree(ROOT / "tools" / "roots", project / "tools" / "roots", symlinks=True)
-    for name in PROJECT:
-        shutil.copy(ROOT / name, project / name)
-    subprocess.run(["git", "init", "--quiet"], check=True, cwd=project)
-    (project / "params.yaml").write_text("cases: {}\nrecords: {}\nmodels: {}\ncontrollers: {}\n")
-
-
-def _loopwright(project: Path, *words: str) -> tuple[int, list[str]]:
-    """Exit status of a command and the lines that it printed."""
-    own = {
-        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONPATH": str(project / "tools/roots"),
-    }
-    done = subprocess.run(
-        [sys.executable, "-m", "loopwright.pipeline", *words],
-        cwd=project, env={**os.environ, **own}, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    )  # fmt: skip
-    return done.returncode, [f"$ loopwright {' '.join(words)}", *done.stdout.splitlines()]

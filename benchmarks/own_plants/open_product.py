@@ -8,7 +8,8 @@ from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
-from closed_product import Columns, by_run, withheld
+from _project import withheld
+from closed_product import Columns, by_run
 from closed_record import START
 from loops import scored
 from plant import OwnPlant

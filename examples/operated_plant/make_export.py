@@ -6,7 +6,8 @@ Hot and cold water are mixed, and an outlet valve lets the mixture go:
     A h dT/dt = q_hot (T_hot - T) + q_cold (T_cold - T) - k (T - T_room)
 
 with h the level [m] and q the flows [m3/s], each its valve's opening times its largest flow. Sampled every 10 s, all
-three valves moved by hand. Two valves would do for temperature and level; resting values and costs decide the third.
+three valves moved by hand. The mixture's flow FI-4 has no set point: the plant behind takes what lies in a range.
+Three valves for two variables and a range: resting values and costs decide what these leave open.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ import numpy as np
 
 PERIOD_S, HOURS, DEAD_S, PARTS = 10.0, 24, 20.0, 10
 START = datetime(2024, 3, 4, 6, 0, 0, tzinfo=UTC)
-HEADER = ["Timestamp", "TIC-1", "LIC-2", "FV-1", "FV-2", "FV-3"]
-UNITS = ["", "degC", "%", "%", "%", "%"]
+HEADER = ["Timestamp", "TIC-1", "LIC-2", "FV-1", "FV-2", "FV-3", "FI-4"]
+UNITS = ["", "degC", "%", "%", "%", "%", "l/s"]
 AREA, HEIGHT = 0.4, 2.0  # [m2], [m] at a level of 100 %
 MOST_HOT, MOST_COLD, OUT = 0.009, 0.009, 0.0135  # [m3/s], [m3/s], [m2.5/s]
 T_HOT, T_COLD, T_ROOM, LOSS = 80.0, 12.0, 18.0, 2e-4  # [degC], [m3/s]
@@ -39,13 +40,14 @@ def moved(random: np.random.Generator, n: int) -> np.ndarray:
     return valves
 
 
-def simulated(random: np.random.Generator, valves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Temperature [degC] and level [%], (n,) each, with loads that nobody measures."""
+def simulated(random: np.random.Generator, valves: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Temperature [degC], level [%] and flow of the mixture [l/s], (n,) each, with loads that nobody measures."""
     n, dead = len(valves), int(DEAD_S / PERIOD_S)
-    temperature, level = np.empty(n), np.empty(n)
+    temperature, level, flow = np.empty(n), np.empty(n), np.empty(n)
     t, h, hot = 40.0, 0.9, T_HOT
     for k in range(n):
         temperature[k], level[k] = t, 100 * h / HEIGHT
+        flow[k] = 1000 * OUT * valves[max(k - 1, 0), 2] / 100 * np.sqrt(h)  # read before the valve moves
         hot += 0.01 * (T_HOT - hot) + random.normal(0, 0.1)
         feed, out = valves[max(k - dead, 0), :2] / 100, valves[k, 2] / 100
         for _ in range(PARTS):
@@ -54,7 +56,7 @@ def simulated(random: np.random.Generator, valves: np.ndarray) -> tuple[np.ndarr
             t += PERIOD_S / PARTS * heat / (AREA * max(h, 0.1))
             h += PERIOD_S / PARTS / AREA * (q_hot + q_cold - OUT * out * np.sqrt(h))
             h = min(max(h, 0.05), HEIGHT)
-    return temperature + random.normal(0, 0.1, n), level + random.normal(0, 0.2, n)
+    return temperature + random.normal(0, 0.1, n), level + random.normal(0, 0.2, n), flow + random.normal(0, 0.05, n)
 
 
 def main() -> None:
@@ -62,13 +64,14 @@ def main() -> None:
         sys.exit("usage: python make_export.py FILE.csv")
     random = np.random.default_rng(11)
     valves = moved(random, int(HOURS * 3600 / PERIOD_S))
-    temperature, level = simulated(random, valves)
+    temperature, level, flow = simulated(random, valves)
     with Path(sys.argv[1]).open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerows([HEADER, UNITS])
         for k, at in enumerate(valves):
             stamp = (START + timedelta(seconds=k * PERIOD_S)).isoformat().replace("+00:00", "Z")
-            rows.writerow([stamp, f"{temperature[k]:.2f}", f"{level[k]:.2f}", *(f"{v:.1f}" for v in at)])
+            valve = (f"{v:.1f}" for v in at)
+            rows.writerow([stamp, f"{temperature[k]:.2f}", f"{level[k]:.2f}", *valve, f"{flow[k]:.3f}"])
 
 
 if __name__ == "__main__":

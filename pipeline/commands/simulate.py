@@ -45,8 +45,8 @@ T = TypeVar("T")
 def options(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
 
-    def events(option: str, form: str, words: str) -> None:
-        parse = partial(_argument, partial(parse_event, form=form))
+    def events(option: str, form: str, words: str, switches: bool = False) -> None:
+        parse = partial(_argument, partial(parse_event, form=form, switches=switches))
         add(option, metavar=form, type=parse, action="append", default=[], help=words)
 
     add = parser.add_argument
@@ -61,7 +61,7 @@ def options(parser: argparse.ArgumentParser) -> None:
         "PV=STD",
         "standard deviation of a reading's noise, of a measured disturbance too, over the whole run",
     )
-    events("--operate", "NAME=VALUE[@S]", "what operators change of the file's defaults, from time S on")
+    events("--operate", "NAME=VALUE[@S]", "what operators change of the file's defaults, from time S on", switches=True)
     add("--course", metavar="FILE.csv", type=Path,
         help="set points and measured disturbances by time from the start, which the law knows before")  # fmt: skip
     add("--straight", metavar="NAME", action="append", default=[],

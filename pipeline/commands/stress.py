@@ -56,7 +56,7 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 def _operated(text: str) -> TimedValue:
     try:
-        return parse_event(text, OPERATE)
+        return parse_event(text, OPERATE, switches=True)
     except ParamsError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 

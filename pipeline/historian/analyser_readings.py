@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.config.known import Known
+from loopwright.pipeline.historian.cleaning.findings import Finding, counted
 from loopwright.pipeline.metrics import Array
 from loopwright.pipeline.records.record import Record
 
@@ -75,12 +76,11 @@ def of_samples(known: Sequence[Known], late: Mapping[str, int], period_s: float)
     return tuple(map(earlier, known))
 
 
-def in_place(record: Record) -> Record:
+def in_place(record: Record, found: Aligned) -> Record:
     """The record with values of an analyser in the rows between its readings, in the rows in which it hands them over.
 
-    They are those of ``Aligned``, as late as the readings are: for a first look, which asks for a number in each row.
+    They are those of ``found``, as late as the readings are: for a first look, which asks for a number in each row.
     """
-    found = Aligned.of(record, len(record.pv_signals))
     pv = found.record.pv.copy()
     for first, end in _bounds(record.run):
         for j, late in enumerate(found.late):
@@ -88,6 +88,21 @@ def in_place(record: Record) -> Record:
                 pv[first + late : end, j] = found.record.pv[first : end - late, j]
                 pv[first : first + late, j] = pv[min(first + late, end - 1), j]
     return record if found.record is record else replace(record, pv=pv)
+
+
+def of_lateness(found: Aligned, tags: Mapping[str, str]) -> list[Finding]:
+    """A finding for each analyser on how late its readings are; ``tags`` are those of the PVs' names."""
+    findings = []
+    for i in found.record.seldom:
+        late, signal = found.late[i], found.record.pv_signals[i]
+        words = "no lateness is seen in its new readings, though slow answers can hide one"
+        if late:
+            words = (
+                f"its new readings come {counted(late, 'row')} ({late * found.record.period_s:g} s) or more after what "
+                "they measure, by the inputs' moves; slow answers can hide some rows"
+            )
+        findings.append(Finding("analyser", tags[signal.name], words))
+    return findings
 
 
 def _bounds(run: NDArray[np.int64]) -> list[tuple[int, int]]:

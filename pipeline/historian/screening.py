@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loopwright.pipeline.errors import RecordError
-from loopwright.pipeline.historian.analyser_readings import in_place
+from loopwright.pipeline.historian.analyser_readings import Aligned, in_place, of_lateness
 from loopwright.pipeline.historian.arx_model import Linear, believed
 from loopwright.pipeline.historian.cleaning.findings import Finding, RecordJudgement, Screening, TagReport, counted
 from loopwright.pipeline.historian.cleaning.new_readings import new_readings, put_analysers
@@ -193,7 +193,10 @@ def screen_export(
     findings += [f for t in tags if t.role == "mode" for f in of_mode(own[t.tag], grid.value[t.tag])]
     code = row_codes(grid, signals, tags, own, without_modes)
     record = replace(record_of(grid, code, signals), fed_back=pace.fed_back)
-    excerpt = in_place(evenly(record))
+    excerpt = evenly(record)
+    aligned = Aligned.of(excerpt, len(record.pv_signals))
+    excerpt = in_place(excerpt, aligned)
+    findings += of_lateness(aligned, {t.name: t.tag for t in signals})
     models = models_of(excerpt)
     moved = max(
         (len(moves_of(grid.value[t.tag][code == 0][:WINDOWED], record.run[:WINDOWED])) for t in tags if t.role == "sp"),

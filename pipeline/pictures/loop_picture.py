@@ -7,6 +7,7 @@ import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,10 @@ from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.metrics import mv_travel
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.serving.manifest import OperateEntry, Signal
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 STAYING_PART = 10  # an error stays that is there over the last tenth of a run
@@ -137,29 +142,44 @@ def write_csv(path: Path, plant: Simulator, history: History) -> None:
 def draw(
     path: Path, plant: Simulator, history: History, title: str, marks: Mapping[float, str], dpi: float = RUN_DPI
 ) -> None:
-    """Controlled variables with their set points, MVs, events and modes; PipelineError where it cannot be written."""
+    """Controlled variables with their set points, MVs, events and modes; PipelineError where it cannot be written.
+
+    It shows ranges and operators' limits as bands, resting values, and what is out of use, of a law with ``operate``.
+    """
+    figure = drawn(plant, history, title, marks)
+    _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=dpi))
+
+
+def drawn(plant: Simulator, history: History, title: str, marks: Mapping[float, str]) -> Figure:
+    """The picture that ``draw`` writes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     time_s = np.array(history.time_s)
     sp, pv, mv = np.array(history.sp), np.array(history.pv), np.array(history.mv)
-    heights = [1.0] * len(plant.sp_signals) + [1.0 if s.values is None else DISCRETE_SHARE for s in plant.mv_signals]
+    shown = [(i, s) for i, s in enumerate(plant.pv_signals) if i < sp.shape[1] or _ranged(history, s).any()]
+    heights = [1.0] * len(shown) + [1.0 if s.values is None else DISCRETE_SHARE for s in plant.mv_signals]
     figure = Figure(figsize=(9, 1.0 + 2.4 * sum(heights)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     figure.suptitle(title)
-    for i, (ax, s) in enumerate(zip(axes, plant.sp_signals, strict=False)):
-        ax.step(time_s, sp[:, i], where="post", color="0.35", linestyle="--", linewidth=1, label="set point")
+    for ax, (i, s) in zip(axes, shown, strict=False):
+        if i < sp.shape[1]:
+            followed = np.where(_follows(history, s), sp[:, i], np.nan)
+            ax.step(time_s, followed, where="post", color="0.35", linestyle="--", linewidth=1, label="set point")
         ax.plot(time_s, pv[:, i], color="C0", linewidth=1.3, label="controlled variable")
         ax.set_ylabel(_label(s))
+        _draw_range(ax, history, s)
     for i, s in enumerate(plant.mv_signals):
-        ax = axes[len(plant.sp_signals) + i]
+        ax = axes[len(shown) + i]
         ax.step(time_s, mv[:, i], where="post", color="C3", linewidth=1)
         ax.set_ylabel(_label(s))
         if s.values is not None:
             room = 0.3 * (s.high - s.low)
             ax.set_yticks(s.values, [f"{v:g}" for v in s.values])
             ax.set_ylim(s.low - room, s.high + room)
+        _draw_range(ax, history, s)
+        _draw_rest(ax, history, s)
     for ax in axes:
         ax.grid(alpha=0.3)
         for at in marks:
@@ -177,10 +197,44 @@ def draw(
             text, (at, 1), xycoords=("data", "axes fraction"), xytext=(0, 3 + 9 * (k % 2)), textcoords="offset points",
             va="bottom", fontsize="x-small", color="C1",
         )  # fmt: skip
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize="small", frameon=False)
+    named = {text: handle for ax in axes for handle, text in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(
+        named.values(), named, loc="outside lower center", ncols=min(len(named), 4), fontsize="small", frameon=False
+    )
     axes[-1].set_xlabel("time [s]")
-    _replace(path, lambda draft: figure.savefig(draft, format=path.suffix.lstrip(".") or "png", dpi=dpi))
+    return figure
+
+
+def _ranged(history: History, s: Signal) -> NDArray[np.bool_]:
+    """Scans (n,) at which operators have a signal in use within less than its own range."""
+    low, high, used = (history.of_entry(f"{s.name}.{what}") for what in ("low", "high", "use"))
+    if low is None or high is None or used is None:
+        return np.zeros(len(history.sp), dtype=np.bool_)
+    return (used > 0) & ((low > s.low) | (high < s.high))
+
+
+def _draw_range(ax: Axes, history: History, s: Signal) -> None:
+    """The range of a PV or operators' limits of an MV as a band, where there are any, and the time out of use."""
+    from loopwright.pipeline.pictures.operated_pictures import IN_RANGE, OUT_OF_USE
+
+    ranged, used = _ranged(history, s), history.of_entry(f"{s.name}.use")
+    if ranged.any():
+        low, high = (np.asarray(history.of_entry(f"{s.name}.{what}")) for what in ("low", "high"))
+        ax.fill_between(history.time_s, low, high, where=ranged, step="post", zorder=1, label="range", **IN_RANGE)
+    if used is not None and not used.all():
+        ax.fill_between(
+            history.time_s, 0, 1, where=used == 0, step="post", transform=ax.get_xaxis_transform(),
+            label="out of use", **OUT_OF_USE,
+        )  # fmt: skip
+
+
+def _draw_rest(ax: Axes, history: History, s: Signal) -> None:
+    """The resting value of an MV while it has one."""
+    from loopwright.pipeline.pictures.operated_pictures import RESTING
+
+    rest, used = (history.of_entry(f"{s.name}.{what}") for what in ("rest", "rest_use"))
+    if rest is not None and used is not None and used.any():
+        ax.step(history.time_s, np.where(used > 0, rest, np.nan), where="post", label="resting value", **RESTING)
 
 
 def _label(signal: Signal) -> str:

@@ -110,7 +110,7 @@ def _controller(controller: Controller, validation: Validation | None) -> dict[s
         "file": controller.path.name,
         "sha256": controller.sha256,
         **{key: manifest[key] for key in ("schema", "law", "period_s", "n_state", "info", "inputs")},
-        **{key: manifest[key] for key in ("sp", "pv", "dv", "mv", "operate") if key in manifest},
+        **{key: manifest[key] for key in ("sp", "pv", "dv", "mv", "operate", "ahead") if key in manifest},
     }
 
 

@@ -121,6 +121,7 @@ def model_section(evidence: Evidence) -> ModelSection | None:
     verdicts = (*_verdicts(part), *drift_answers(evidence, part), *_trends(evidence, part), *_left_open(part, mvs))
     sentences = (
         *verdicts,
+        *_late(evidence, part),
         *_dead_times(evidence, part),
         *_noisy_disturbances(evidence, part),
         *_asked(evidence),
@@ -218,6 +219,18 @@ def _left_open(part: Mapping[str, Any], mvs: Sequence[str]) -> tuple[str, ...]:
     return (
         f"Models as likely as this one differ by {gains}, by {pace} in speed and by {dead:.2g} periods in dead time "
         "(standard deviations).",
+    )
+
+
+def _late(evidence: Evidence, part: Mapping[str, Any]) -> tuple[str, ...]:
+    """The lateness of analysers' results that stands in the model, beside its own lags."""
+    period_s = evidence.case.plant_class.period_s
+    return tuple(
+        f"{name} is an analyser: the model hands its results over {periods} periods ({period_s * periods:g} s) after "
+        "they were true. Slow lags may hide a part of the lateness, and of the plant's own dead time it holds what all "
+        f'inputs share; one that you know is said by --known "{name}/MV=dead FROM..TO".'
+        for name, periods in (part.get("late") or {}).items()
+        if periods
     )
 
 

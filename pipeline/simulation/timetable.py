@@ -16,6 +16,7 @@ from loopwright.pipeline.simulation.operator_changes import OperatorChange
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.simulation.simulate import DV_DRAW, noise_draws
 from loopwright.serving.manifest import Signal
+from loopwright.serving.operating import SWITCH_WORDS
 
 SETTLE_SAMPLES = 80  # after the last event, where no duration was asked for
 MAX_SAMPLES = 10_000_000  # of a simulation
@@ -60,17 +61,20 @@ class Timetable:
         return next((s for s in self.manual if s.start_s <= time_s < s.end_s), None)
 
 
-def parse_event(text: str, form: str) -> TimedValue:
+def parse_event(text: str, form: str, *, switches: bool = False) -> TimedValue:
     """An event with a name where the form has ``=``, and with a time where it allows ``@``; ParamsError shows it.
 
-    A form that begins with ``[`` leaves the name to the writer.
+    A form that begins with ``[`` leaves the name to the writer. With ``switches`` a value may be true or false.
     """
     named = "=" in (text if form.startswith("[") else form)
     name, equals, rest = text.partition("=") if named else ("", "=", text)
     value, at, time_s = rest.partition("@")
     if not equals or (named and not name) or (at and "@" not in form):
         raise ParamsError(f"{text!r} is not of the form {form}")
-    event = TimedValue(_number(value, text, form), _number(time_s, text, form) if at else 0.0, name)
+    number = SWITCH_WORDS.get(value.lower()) if switches else None
+    event = TimedValue(
+        _number(value, text, form) if number is None else number, _number(time_s, text, form) if at else 0.0, name
+    )
     if event.time_s < 0:
         raise ParamsError(f"{text!r}: the time must not be negative")
     return event

@@ -6,7 +6,7 @@ strips ``data:`` images and every size or style, so pictures are drawn in the si
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from html import escape
 
 from loopwright.pipeline.evaluation.law_evidence import FormAnalysis
@@ -58,15 +58,25 @@ def standing(name: str, law: str, validation: Validation | None, champion: str |
 
 
 def version_description(
-    validation: Validation | None, gate: Gate, run_id: str, picture: str | None, signed: str = ""
+    validation: Validation | None,
+    gate: Gate,
+    run_id: str,
+    picture: str | None,
+    signed: str = "",
+    operated: Mapping[str, str] | None = None,
 ) -> str:
-    """A version's description: verdict, signer, closed-loop evidence per scenario, analysis, picture of the loop."""
+    """A version's description: verdict, signer, closed-loop evidence per scenario, analysis, picture of the loop.
+
+    ``operated`` are the pictures of tests in which operators change something, by test: the worst of them is shown.
+    """
     parts = [_verdict(gate), f"<p>Signed by {escape(signed)}.</p>" if signed else "", _grounds(validation)]
     if validation is not None:
         parts += [_table(validation, gate), _operated(validation, gate.law), _analysis(validation, gate.law)]
     if picture:
         alt = "Closed loop on the test that weighs most, beside the baseline of the case"
-        parts.append(f'<p><img src="get-artifact?path={picture}&run_uuid={run_id}" alt="{alt}"></p>')
+        parts.append(_image(picture, run_id, alt))
+    if validation is not None and operated:
+        parts.append(_worst(validation, gate.law, run_id, operated))
     return "\n".join(filter(None, parts))
 
 
@@ -138,6 +148,23 @@ def _operated(validation: Validation, law: str) -> str:
     ]
     heads = ["Operators' changes", "outside ranges", "in the end", "share of the gain", "borne by the last rank"]
     return _html_table(heads, rows) if rows else ""
+
+
+def _worst(validation: Validation, law: str, run_id: str, pictures: Mapping[str, str]) -> str:
+    """The picture of the test that ends outside its ranges longest, and where the others are."""
+    result = validation.laws.get(law)
+    tests = result.operated if result else {}
+    drawn = [(test.late or 0.0, name) for name, test in tests.items() if name in pictures]
+    if not drawn:
+        return ""
+    name = max(drawn)[1]
+    title = tests[name].title
+    words = f"Outside its ranges longest in the end: {title}. Pictures of all such tests: folder operated of the run."
+    return f"<p>{escape(words)}</p>{_image(pictures[name], run_id, escape(title))}"
+
+
+def _image(path: str, run_id: str, alt: str) -> str:
+    return f'<p><img src="get-artifact?path={path}&run_uuid={run_id}" alt="{alt}"></p>'
 
 
 def _percent(share: float | None) -> str:

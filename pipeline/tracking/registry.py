@@ -73,11 +73,13 @@ def register(
     picture: str | None,
     tags: Mapping[str, str],
     signer: Signer | None = None,
+    operated: Mapping[str, str] | None = None,
 ) -> tuple[str, bool]:
     """Register the controller file ``path`` unless its digest is known; refresh its evidence and its signature.
 
-    ``picture`` is an artifact of the run. Without a ``signer`` the signature that is there stays. Returns one line that
-    says what happened, and whether a version was made.
+    ``picture`` is an artifact of the run, as those of ``operated`` are, by the test that they show. Without a
+    ``signer`` the signature that is there stays. Returns one line that says what happened, and whether a version was
+    made.
     """
     law = path.stem
     name = f"{case}-{law}"
@@ -94,7 +96,8 @@ def register(
     own = {"sha256": digest, **explained, "law": law, "case": case, "period_s": str(manifest.period_s)}
     before, at = ({}, run_id) if known is None else (dict(known.tags), str(known.run_id))
     signature = signing.present(before) if signer is None else signer.attach(client, at, path, before)
-    description = harmless(card.version_description(validation, gate, run_id, picture, signing.words(signature)))
+    signed = signing.words(signature)
+    description = harmless(card.version_description(validation, gate, run_id, picture, signed, operated))
     analysis = {f"analysis_{name}": f"{value:.6g}" for name, value in card.analysis_figures(validation, law).items()}
     shown = {**gate.tags(), **analysis, **own, **signature, **tags}  # in this order they are shown
     tags = {key: plain(value) for key, value in shown.items()}

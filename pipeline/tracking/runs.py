@@ -215,10 +215,12 @@ def _publish_case(
             if result.key in known:
                 refresh(client, known[result.key], law, validation)
             picture = _add_picture(client, run_id, evidence.parent / "figures" / f"closed_loop_{law}.png")
+            operated = {}
             for drawn in sorted((evidence.parent / "figures").glob(f"operated_{law}_*.png")):
                 client.log_artifact(run_id, str(drawn), "operated")
+                operated[drawn.stem.removeprefix(f"operated_{law}_")] = f"operated/{drawn.name}"
             marks = {**tags[result.name], "stage_key": result.key}
-            line, is_new = register(client, case, path, run_id, validation, picture, marks, signer)
+            line, is_new = register(client, case, path, run_id, validation, picture, marks, signer, operated)
             made += is_new
             _say(line)
             digests[f"{case}-{law}"] = sha256(path)

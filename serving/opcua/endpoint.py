@@ -106,7 +106,7 @@ class OpcUaEndpoint:
         names, rewrite_s = [s.name for s in manifest.mv], server.rewrite_s / speed
         self.sender = MvSender(names, rewrite_s, self.answer_s, NodeLease(self.period_s), clock)
         self.nameplates, self._identified = Nameplates(nodes, manifest, spaces), identified
-        self._analysers = Analysers(manifest, nodes.analysers, speed)
+        self._analysers = Analysers(manifest, nodes.results(), speed)
         self._heartbeat, self._sampling = Heartbeat(), NodeSampling(manifest, server, nodes, self.nameplates)
         self._wake: asyncio.Event | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -160,7 +160,7 @@ class OpcUaEndpoint:
         )
         sample = replace(sample, local=values.local) if values.local else sample
         sample = self._late_apart(sample, values, late, now) if late and self._sampling.apart else sample
-        sample = self._analysers.look(sample, values.arrived_s)
+        sample = self._analysers.look(sample, values.arrived_s, values.stamps)
         return sample if self._sampling.apart else replace(sample, fresh=None)
 
     def _late(self, values: Values, now: float) -> list[str]:

@@ -114,6 +114,7 @@ class Values:
     bad_pv: tuple[str, ...] = ()
     asked_operate: Mapping[str, float] = field(default_factory=dict)
     local: tuple[str, ...] = ()  # why the plant has each MV itself, or it is read badly alone; or empty
+    stamps: Mapping[str, float] = field(default_factory=dict)  # source times [s] of analysers that have one, by PV
 
 
 class NodeSampling:
@@ -209,6 +210,11 @@ class NodeSampling:
                 if np.isfinite(found.get(f"operate {e.name}", np.nan))
             },
             tuple(away.get(s.name, "") for s in m.mv) if away else (),
+            {
+                row.signal.name: answer.source_s
+                for row, answer in zip(plan.rows, answers, strict=False)
+                if row.stands and row.signal is not None and answer.source_s is not None
+            },
         )
 
     def _tells(self, name: str, answer: NodeReading, *, usable: bool) -> None:

@@ -87,6 +87,25 @@ class LocalNode:
 
 
 @dataclass(frozen=True, slots=True)
+class AnalyserNode:
+    """The way in which an analyser's new results are told from one that stands.
+
+    ``longest_s`` is the longest time [s] without a new one. A result is ``new`` where its ``number`` is another one;
+    with ``source_time`` also where its source time is, which tells two equal results apart. It suits a server that
+    stamps a value when it is made: one that stamps what stands anew would make each reading a result.
+    """
+
+    longest_s: float
+    new: Literal["number", "source_time"] = "number"
+
+    def __post_init__(self) -> None:
+        if not (isfinite(self.longest_s) and self.longest_s > 0):
+            raise LoopError(
+                f"nodes.analysers: longest_s is {self.longest_s:g}; it needs the longest time in seconds, above 0"
+            )
+
+
+@dataclass(frozen=True, slots=True)
 class HandBack:
     """The node by which the plant's own controller takes the plant, and the number that asks it to."""
 
@@ -103,7 +122,8 @@ class Nodes:
     plant. Without it a node LoopwrightLease is the lease that lies beside those of the MVs; "none": there is no lease.
     ``operate`` has nodes by which the plant's own operator changes values of the law's ``operate``, each by its name,
     ``local`` those that say whether the plant has an MV itself. ``analysers`` are process variables whose number stands
-    between two results: each with the longest time [s] without a new one.
+    between two results: each with the longest time [s] without a new one, or a table that also says how a new one is
+    told.
     """
 
     pv: Mapping[str, str | Point]
@@ -112,7 +132,7 @@ class Nodes:
     sp: Mapping[str, str | Point] = field(default_factory=dict)
     operate: Mapping[str, str | Point] = field(default_factory=dict)
     local: Mapping[str, LocalNode] = field(default_factory=dict)
-    analysers: Mapping[str, float] = field(default_factory=dict)
+    analysers: Mapping[str, float | AnalyserNode] = field(default_factory=dict)
     mode: ModeNode | None = None
     heartbeat: str = ""
     watchdog: str = ""
@@ -127,6 +147,10 @@ class Nodes:
     def points(self, name: Group) -> dict[str, Point]:
         """The points of one group by signal name, those of ``operate`` by its entries'."""
         return {n: Point(p) if isinstance(p, str) else p for n, p in getattr(self, name).items()}
+
+    def results(self) -> dict[str, AnalyserNode]:
+        """The analysers by the name of their PV; LoopError for a longest time that is none."""
+        return {n: of if isinstance(of, AnalyserNode) else AnalyserNode(of) for n, of in self.analysers.items()}
 
     def ids(self) -> list[str]:
         """Every node id that is given, as it is written."""
@@ -153,11 +177,9 @@ class Nodes:
             if name != "mv" and any(p.read_back for p in points.values()):
                 raise LoopError(f"nodes.{name} has a read_back, which only an MV has")
         pvs = [s.name for s in manifest.pv]
-        for given, wait in self.analysers.items():
+        for given in self.results():
             if given not in pvs:
                 raise LoopError(f"nodes.analysers has {given!r}, which is no PV{nearest(given, pvs)}")
-            if not (isfinite(wait) and wait > 0):
-                raise LoopError(f"nodes.analysers: {given} is {wait:g}; it needs the longest time in seconds, above 0")
         if self.analysers and "fresh" not in manifest.inputs:
             raise LoopError(
                 f"nodes.analysers: {manifest.law} takes each number for a new reading; design it with `operate: {{}}`"

@@ -11,6 +11,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 LONGEST_BODY = 10_000  # bytes
+LONGEST_CHANGE = (
+    100_000  # bytes of a change, which the token is asked for first: as the loop takes, for a course's file
+)
 HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -73,9 +76,15 @@ class Access:
         if headers.getlist("transfer-encoding") or headers.getlist("content-encoding"):
             return 413, "a change is sent as it is, and says how long it is"
         length = headers.get("content-length", "")
-        if not (length.isascii() and length.isdigit()) or int(length) > LONGEST_BODY:
-            return 413, f"a change has at most {LONGEST_BODY} bytes, and says how many"
+        most = longest(scope["path"])
+        if not (length.isascii() and length.isdigit()) or int(length) > most:
+            return 413, f"a change has at most {most} bytes, and says how many"
         return None
+
+
+def longest(path: str) -> int:
+    """The most bytes that the body of a request to a path may have."""
+    return LONGEST_CHANGE if path == "/api/change" else LONGEST_BODY
 
 
 # ---------------------------------------------------------------------------------------------------------- connections

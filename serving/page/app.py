@@ -27,7 +27,7 @@ from loopwright.serving.graph.audit import MAX_GRAPH_BYTES, audit
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 from loopwright.serving.monitor.weekly_report import plain_rows, week_reports
-from loopwright.serving.page.access import LONGEST_BODY, Access
+from loopwright.serving.page.access import Access, longest
 from loopwright.serving.page.foresight import LawForesight
 from loopwright.serving.page.live import ENTRIES, LATER_MS, Ask, Live, Shared, shown
 from loopwright.serving.page.prometheus import metrics_text
@@ -96,6 +96,7 @@ class PageApp:
         self.live = Live(journal, ask, tell)
         self._about = Shared(lambda: self._asked({"do": "about"}))
         self._described = Shared(self._describe)
+        self._courses = Shared(lambda: self._asked({"do": "courses"}))
         self._told = -math.inf
         self._trends, self._waiting = asyncio.Semaphore(TRENDS), 0
         self._foresight = LawForesight(lambda: ask({"do": "inputs"}))
@@ -113,6 +114,7 @@ class PageApp:
             Route("/api/weeks", self.weeks),
             Route("/api/live", self.stream),
             Route("/api/picture/{digest}", self.picture),
+            Route("/api/courses", self.courses),
             Route("/api/explain", self.explain),
             Route("/api/what-if", self.what_if, methods=["POST"]),
             Route("/api/change", self.change, methods=["POST"]),
@@ -226,12 +228,16 @@ class PageApp:
                 self.tell(f"page: a wrong token was refused (from {request.client.host if request.client else '?'})")
             return JSONResponse({"error": "the token is not the loop's; it prints its token at its start"}, 401)
         wanted = await _json(request)
-        if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "inputs", "picture"}:
+        if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "inputs", "courses", "picture"}:
             raise HTTPException(400, 'a change is an object with "do"')
         if wanted.get("do") == "swap" and not _is_name(wanted.get("value")):
             raise HTTPException(400, "the page tries only files that lie beside the controller in charge, by name")
         answer = await asyncio.to_thread(self.ask, wanted)
         return JSONResponse(answer, 409 if "error" in answer else 200)
+
+    async def courses(self, _: Request) -> Response:
+        """The courses that stand, with their points."""
+        return JSONResponse(await self._courses())
 
     async def explain(self, _: Request) -> Response:
         """Courses that the law in charge predicts and plans, and the parts of its next moves; 404 without them."""
@@ -303,8 +309,8 @@ async def _body(request: Request) -> bytes:
     body = bytearray()
     async for piece in request.stream():
         body += piece
-        if len(body) > LONGEST_BODY:
-            raise HTTPException(413, f"a change has at most {LONGEST_BODY} bytes")
+        if len(body) > (most := longest(request.url.path)):
+            raise HTTPException(413, f"a change has at most {most} bytes")
     return bytes(body)
 
 

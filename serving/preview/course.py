@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import is_number, nearest, shown
 from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.preview.ahead import AheadInput
 from loopwright.serving.preview.differences import Differences
 from loopwright.serving.ranges import within
 
@@ -34,6 +35,8 @@ class Course:
     times_s: Array  # (n,) of the loop's clock, none below the one before
     values: Array  # (n,)
     straight: bool
+    who: str = ""  # gave it; empty where nobody said so
+    number: int = 0  # of all that the loop was given, this is which
 
     def at(self, time_s: Array, present: float) -> Array:
         """The values at times (...,); ``present`` before the first point of one that holds its values."""
@@ -72,6 +75,8 @@ class Courses:
         self._period_s = manifest.period_s
         self._periods = 0  # that have passed since the loop began
         self._of: dict[str, Course] = {}
+        self._given = 0  # courses until now
+        self._differences: dict[int, Differences] = {}  # by the input that they belong to: made once, not at each scan
         self._left: tuple[str, ...] = ()  # signals whose course left the range of the controller in charge
         self.finished: tuple[str, ...] = ()  # signals whose course came to its last point at the last scan
 
@@ -83,6 +88,11 @@ class Courses:
     def passed(self, periods: int) -> None:
         """So many periods are over, with a scan or without."""
         self._periods += periods
+
+    @property
+    def standing(self) -> dict[str, Course]:
+        """The courses that are not over, by signal; their times are those of ``now_s``."""
+        return dict(self._of)
 
     @property
     def left(self) -> dict[str, list[tuple[float, float]]]:
@@ -99,15 +109,18 @@ class Courses:
         now = self.now_s
         return {name: (float(of.times_s[-1]) - now, float(of.values[-1])) for name, of in list(self._of.items())}
 
-    def give(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> None:
-        """Courses of some signals, in place of those that they had; LoopError as ``checked``."""
-        self._of |= {course.signal: course for course in self.checked(points, straight)}
+    def give(self, points: Mapping[str, Points], straight: Collection[str] = (), who: str = "") -> None:
+        """Courses of some signals, in place of those that they had, by ``who``; LoopError as ``checked``."""
+        for course in self.checked(points, straight):
+            self._given += 1
+            self._of[course.signal] = replace(course, who=who, number=self._given)
 
     def checked(self, points: Mapping[str, Points], straight: Collection[str] = ()) -> list[Course]:
         """The courses that ``give`` would set; LoopError with the signal and the point that is wrong.
 
         An unknown name, one that is a set point and a disturbance, no points or too many, a number that is not finite,
-        a time before the one before it, a value outside the signal's range, or a last point before now.
+        a time before the one before it, a value outside the signal's range, or a last point before now. The error's
+        ``entry`` is the signal and the place of the point, as TIC-1.2, where one point is wrong.
         """
         if not isinstance(points, Mapping) or not points:
             raise LoopError('a course is given by name, as {"TIC-1": [(0, 50), (600, 60)]}; times in s from now')
@@ -125,20 +138,26 @@ class Courses:
             raise LoopError(f"there is no set point or measured disturbance {shown(name)}{nearest(name, {**sp, **dv})}")
         rows = _pairs(name, points)
         signal = sp.get(name) or dv[name]
-        for (before, _), (time_s, value) in zip([rows[0], *rows], rows, strict=False):
+        for k, ((before, _), (time_s, value)) in enumerate(zip([rows[0], *rows], rows, strict=False), start=1):
             if time_s < before:
-                raise LoopError(f"the course of {name} goes back in time, from {before:g} s to {time_s:g} s")
+                raise _wrong(name, k, f"the course of {name} goes back in time, from {before:g} s to {time_s:g} s")
             if name in sp:
-                within([value], (signal,), f"course at {time_s:g} s: set point")
+                try:
+                    within([value], (signal,), f"course at {time_s:g} s: set point")
+                except LoopError as error:
+                    raise _wrong(name, k, str(error)) from None
             elif not signal.low <= value <= signal.high:
-                raise LoopError(
+                raise _wrong(
+                    name,
+                    k,
                     f"the course of {name} is {value:g} {signal.unit} at {time_s:g} s; allowed is {signal.low:g} to "
-                    f"{signal.high:g} {signal.unit}"
+                    f"{signal.high:g} {signal.unit}",
                 )
         if straight and signal.values is not None:
             raise LoopError(f"{name} has only some values; its course cannot run straight between them")
         if rows[-1][0] < 0:
-            raise LoopError(f"the course of {name} ends {-rows[-1][0]:g} s before now; give what is to come")
+            words = f"the course of {name} ends {-rows[-1][0]:g} s before now; give what is to come"
+            raise _wrong(name, len(rows), words)
         times, values = np.array(rows).T
         return Course(name, times + self.now_s, values.copy(), straight or name in dv)
 
@@ -193,7 +212,13 @@ class Courses:
                 begins = course.at(np.array([now]), present) if s.group == "dv" else present
                 change[:, i] = course.at(times, present) - begins
         values: Array = np.array([known[s.signal] for s in manifest.ahead.signals])
-        return Differences(manifest.ahead).within(change, values)
+        return self._differences_of(manifest.ahead).within(change, values)
+
+    def _differences_of(self, of: AheadInput) -> Differences:
+        """Those of a controller's input, which keep it, so that no other one has its place in memory."""
+        if id(of) not in self._differences:
+            self._differences[id(of)] = Differences(of)
+        return self._differences[id(of)]
 
 
 def _pairs(name: str, points: Any) -> list[tuple[float, float]]:
@@ -203,10 +228,18 @@ def _pairs(name: str, points: Any) -> list[tuple[float, float]]:
     rows = list(points)
     if not 1 <= len(rows) <= MOST_COURSE_POINTS:
         raise LoopError(f"the course of {name} has {len(rows)} points; it must have 1 to {MOST_COURSE_POINTS}")
-    for row in rows:
+    for k, row in enumerate(rows, start=1):
         if not isinstance(row, Sequence) or isinstance(row, str) or len(row) != 2 or not all(map(is_number, row)):
-            raise LoopError(f"the course of {name} has the point {shown(row)}; it needs a time in s and a value")
+            words = f"the course of {name} has the point {shown(row)}; it needs a time in s and a value"
+            raise _wrong(name, k, words)
     return [(float(t), float(v)) for t, v in rows]
+
+
+def _wrong(name: str, place: int, words: str) -> LoopError:
+    """The error of one point of a course; ``entry`` says which."""
+    error = LoopError(words)
+    error.entry = f"{name}.{place}"
+    return error
 
 
 def described(points: Mapping[str, Points], signals: Iterable[Signal]) -> str:

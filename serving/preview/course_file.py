@@ -14,22 +14,35 @@ TIME_COLUMNS = ("time", "time_s")
 LARGEST_FILE = 20_000_000  # bytes: far above the points that a course may have
 
 
-def read_courses(path: Path, now_s: float) -> dict[str, list[tuple[float, float]]]:
-    """Points (time [s] from now, value) of each signal of a file.
-
-    The first line names the columns: ``time``, then signals. A time is a number of seconds from now, or a date and time
-    as 2026-03-01T14:30, in UTC unless it says otherwise; ``now_s`` is the present one in seconds since 1970. An empty
-    cell is no point of its signal.
+def read_courses(path: Path, now_s: float, speed: float = 1.0) -> dict[str, list[tuple[float, float]]]:
+    """Points (time [s] from now, value) of each signal of a file, see ``courses_of``.
 
     LoopError for a file that cannot be read, and with the line for a cell that is wrong.
     """
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise LoopError(f"{path} has {path.stat().st_size} bytes; a course may have {LARGEST_FILE}")
-        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+        text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise LoopError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        raise LoopError(f"{path} is no CSV file: {error}") from error
+    return courses_of(text, now_s, str(path), speed)
+
+
+def courses_of(text: str, now_s: float, path: str, speed: float = 1.0) -> dict[str, list[tuple[float, float]]]:
+    """Points (time [s] from now, value) of each signal in the text of a file; ``path`` is its name in errors.
+
+    The first line names the columns: ``time``, then signals. A time is a number of seconds from now, or a date and time
+    as 2026-03-01T14:30, in UTC unless it says otherwise; ``now_s`` is the present one in seconds since 1970. A loop
+    that runs ``speed`` times as fast as the clock is there in so much more of its own time. An empty cell is no point
+    of its signal.
+
+    LoopError with the line for what is wrong.
+    """
+    try:
+        rows = list(csv.reader(text.removeprefix("\ufeff").splitlines()))
+    except csv.Error as error:
         raise LoopError(f"{path} is no CSV file: {error}") from error
     names = [name.strip() for name in rows[0]] if rows else []
     if len(names) < 2 or names[0] not in TIME_COLUMNS:
@@ -46,7 +59,7 @@ def read_courses(path: Path, now_s: float) -> dict[str, list[tuple[float, float]
         where = f"{path}, line {number}"
         if len(cells) != len(names):
             raise LoopError(f"{where} has {len(cells)} cells; the first line has {len(names)}")
-        time_s = _time(cells[0], now_s, where)
+        time_s = _time(cells[0], now_s, where, speed)
         for name, cell in zip(names[1:], cells[1:], strict=True):
             if cell:
                 points[name].append((time_s, _number(cell, f"{where}: {name}")))
@@ -56,7 +69,7 @@ def read_courses(path: Path, now_s: float) -> dict[str, list[tuple[float, float]
     return points
 
 
-def _time(cell: str, now_s: float, where: str) -> float:
+def _time(cell: str, now_s: float, where: str, speed: float) -> float:
     """Seconds from now of a cell that is a number of seconds, or a date and time."""
     try:
         seconds = float(cell)
@@ -70,7 +83,7 @@ def _time(cell: str, now_s: float, where: str) -> float:
         raise LoopError(
             f"{where}: the time is {shown(cell)}; it needs seconds from now, or as 2026-03-01T14:30"
         ) from None
-    return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp() - now_s
+    return ((stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp() - now_s) * speed
 
 
 def _number(cell: str, where: str) -> float:

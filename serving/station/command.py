@@ -25,6 +25,7 @@ from loopwright.serving.guard import Sample
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command, Mode
 from loopwright.serving.manifest import Manifest, Signal
+from loopwright.serving.operating import written
 from loopwright.serving.preview.course_file import read_courses
 from loopwright.serving.station.control import ask
 from loopwright.serving.station.journal_export import export, happened, journal_of, lines, tag_table, write_csv
@@ -131,10 +132,10 @@ def _ask(options: argparse.Namespace) -> int:
     if do == "mode":
         value = options.mode
     elif do in {"sp", "mv", "operate"}:
-        value = dict(_pair(text) for text in options.values)
+        value = dict(_pair(text, written if do == "operate" else float) for text in options.values)
     elif do == "course":
         value = (
-            {"points": read_courses(options.courses, time.time()), "straight": options.straight}
+            {"points": read_courses(options.courses, time.time(), settings.speed), "straight": options.straight}
             if options.courses
             else ({"end": options.end} if options.end else None)
         )
@@ -161,12 +162,13 @@ def _user() -> str:
         return f"uid {os.getuid()}"
 
 
-def _pair(text: str) -> tuple[str, float]:
-    name, _, number = text.partition("=")
+def _pair(text: str, number: Callable[[str], float]) -> tuple[str, float]:
+    name, _, value = text.partition("=")
     try:
-        return name, float(number)
+        return name, number(value)
     except ValueError:
-        raise LoopError(f"{text!r} is no NAME=VALUE with a number") from None
+        switch = ", or true or false for a switch" if number is written else ""
+        raise LoopError(f"{text!r} is no NAME=VALUE with a number{switch}") from None
 
 
 def _init(options: argparse.Namespace) -> int:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 from loopwright.serving.active_controller import require_fits
+from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import is_number, nearest, shown
@@ -15,6 +17,7 @@ from loopwright.serving.loop import ControlLoop, Mode, within
 from loopwright.serving.manifest import Signal
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.preview.course import described
+from loopwright.serving.preview.course_file import courses_of
 from loopwright.serving.station.recorder import named
 from loopwright.serving.trust import require_accepted, signer
 
@@ -198,7 +201,7 @@ def ended_words(names: Sequence[str]) -> str:
 
 
 def _course(request: Request, loop: ControlLoop, _: Opened) -> Change:
-    value, known = request.value, ("points", "straight")
+    value = request.value
     if value is None or (isinstance(value, Mapping) and set(value) == {"end"} and _are_names(value["end"])):
         names = tuple(loop.courses.ends) if value is None else tuple(value["end"])
         without = [name for name in names if name not in loop.courses.ends]
@@ -206,19 +209,38 @@ def _course(request: Request, loop: ControlLoop, _: Opened) -> Change:
             raise LoopError(f"{', '.join(without) or 'no signal'} has a course now")
         what = f"the course of {', '.join(names)} ends"
         return Change(lambda loop: _ended(loop, names), what, request.who, request.reason)
-    if not isinstance(value, Mapping) or set(value) - set(known) or not _are_names(value.get("straight", [])):
+    if not isinstance(value, Mapping) or not _is_course(value):
         raise LoopError(
-            'a course needs {"points": {NAME: [[time_s, value], ..]}, "straight": [NAME, ..]}, or {"end": [..]}'
+            'a course needs {"points": {NAME: [[time_s, value], ..]}, "straight": [NAME, ..]}, {"csv": the text of a '
+            'file, "straight": [NAME, ..]}, or {"end": [..]}'
         )
-    points, straight = value.get("points", {}), tuple(value.get("straight", ()))
-    loop.require_course(points, straight)
+    straight = tuple(value.get("straight", ()))
+    try:
+        points = _filed(value["csv"], loop) if "csv" in value else value.get("points", {})
+        loop.require_course(points, straight)
+    except LoopError as error:
+        error.entry = "csv" if "csv" in value else error.entry
+        raise
     m = loop.manifest
     return Change(
-        lambda loop: loop.set_course(points, straight),
+        lambda loop: loop.set_course(points, straight, request.who),
         f"course of {described(points, (*m.sp, *m.dv))}",
         request.who,
         request.reason,
     )
+
+
+def _is_course(value: Mapping[Any, Any]) -> bool:
+    """Whether a request has points or the text of a file, and names that run straight."""
+    if set(value) - {"straight"} not in ({"points"}, {"csv"}, set()):
+        return False
+    return _are_names(value.get("straight", [])) and isinstance(value.get("csv", ""), str)
+
+
+def _filed(text: str, loop: ControlLoop) -> dict[str, list[tuple[float, float]]]:
+    """The courses in the text of a file; its dates are those of the clock, which a plant for trials may outrun."""
+    speed = loop.clock.speed if isinstance(loop.clock, MonotonicClock) else 1.0
+    return courses_of(text, time.time(), "the file", speed)
 
 
 def _ended(loop: ControlLoop, names: Sequence[str]) -> None:

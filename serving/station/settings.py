@@ -154,7 +154,8 @@ class Settings:
     (None: any is). ``accept_unproven`` lets a controller into AUTO whose file does not prove it in closed loop, see
     ``loopwright.serving.trust``. ``local`` says when the plant has an MV itself. ``operate`` has values of the law's
     ``operate`` by name that the loop begins with, in place of the law's own; with ``restore`` those that operators had
-    set when the last loop ended come in their place, and its set points, if its controller is the same. ``page`` is
+    set when the last loop ended come in their place, its set points, and its courses as far as they lie in the future,
+    if its controller is the same. ``page`` is
     HOST:PORT or a table (see ``loopwright.serving.page.process``); empty: none.
     """
 

@@ -39,6 +39,7 @@ from loopwright.serving.station.build_loop import (
 )
 from loopwright.serving.station.control import Answer, Control
 from loopwright.serving.station.housekeeping import LinePrinter, PeriodicTask
+from loopwright.serving.station.last_courses import LastCourses
 from loopwright.serving.station.last_run import Steered
 from loopwright.serving.station.mv_lock import Lease, Locks
 from loopwright.serving.station.plant_side import PlantSide, shown_values
@@ -110,6 +111,7 @@ class Station:
             self.lease.release()
             raise
         self._steered = Steered.before(settings.journal.file)
+        self._courses = LastCourses.before(settings.journal.file)
         self.recorder = Recorder(self.journal, tell, settings.speed)
         self.recorder.end_old_alarms()
         self.locks = Locks(self.lease, self.recorder)
@@ -187,8 +189,7 @@ class Station:
             unproven = judged(m).words if s.start == "AUTO" else ""
             accepted = f"accepted though {unproven}" if unproven else ""
             self.recorder.note("change", "loop.toml", f"started in {s.start}{by}", accepted)
-            again = self._steered.restore if s.restore else self._steered.compare
-            again(self.loop, lambda what, reason: self.recorder.note("change", "loop.toml", what, reason))
+            self._take_back(self.loop)
             report = self.loop.run(n, before=self._before, observe=self._observe, stop=lambda: self.ended)
             self.recorder.note("change", "loop", "ended")
             return report
@@ -247,6 +248,19 @@ class Station:
             self.plant_side.carry_out(self.loop, values)
         self.locks.keep(self.loop)
 
+    def _take_back(self, loop: ControlLoop) -> None:
+        """Set what the last loop had, or say it; courses last, for a set point of an operator ends one."""
+
+        def note(what: str, reason: str) -> None:
+            self.recorder.note("change", "loop.toml", what, reason)
+
+        if self.settings.restore:
+            self._steered.restore(loop, note)
+            self._courses.restore(loop, note, time.time(), self.settings.speed)
+        else:
+            self._steered.compare(loop, note)
+            self._courses.compare(loop, note, time.time())
+
     def _at_last(self, loop: ControlLoop) -> None:
         """A shadow that began without the plant begins at its PVs once it sees them, unless a set point was named."""
         values, sp = self.endpoint.values, self.manifest.sp
@@ -270,6 +284,10 @@ class Station:
         if steered != self._steered:
             self._steered = steered
             steered.keep(self.journal)
+        courses = LastCourses.of(self.loop, self._courses, seen[2], self.settings.speed)
+        if courses != self._courses:
+            courses.keep(self.journal)
+        self._courses = courses
         try:
             self.recorder.scan(self.loop, sample, command)
             operate = np.asarray(self.loop.operate) if self.loop.controller is stepped else None

@@ -53,6 +53,8 @@ def fresh_lines(m: Manifest) -> list[str]:
         "",
         "# [nodes.analysers]  # PVs whose number stands between two results: the longest time [s] without a new one",
         f"# {key_of(m.pv[-1].name)} = {100 * m.period_s:g}",
+        "# or, of a server that stamps a value when it is made, so that two equal results are two:",
+        f'# {key_of(m.pv[-1].name)} = {{ longest_s = {100 * m.period_s:g}, new = "source_time" }}',
     ]
 
 

@@ -9,6 +9,8 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+
 from loopwright.serving.active_controller import LawInputs
 from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.controller import Controller
@@ -19,6 +21,7 @@ from loopwright.serving.loop import Command, ControlLoop
 from loopwright.serving.monitor import Verdict
 from loopwright.serving.monitor.weekly_report import shares
 from loopwright.serving.opcua.values import words
+from loopwright.serving.preview.course import Course
 from loopwright.serving.trust import judged, signer
 from loopwright.serving.words import plain_tree
 
@@ -54,7 +57,8 @@ class Snapshot:
     operated: tuple[tuple[float, tuple[float, ...]], ...]  # since when these and earlier values of it hold
     inputs: LawInputs | None  # of the last step of the controller in charge
     stepped_s: float  # since 1970, when that was
-    courses: Mapping[str, tuple[float, float]]  # last point of each: time [s] from the next scan on, value
+    courses: Mapping[str, Course]  # those that stand
+    next_s: float  # the loop's time of the next scan, as the courses count it
     verdicts: tuple[Verdict, ...]
     numbers: Mapping[str, float]
     week: str  # that the counts are of
@@ -91,7 +95,8 @@ class Snapshot:
             operated=operated,
             inputs=loop.stepped,
             stepped_s=stepped_s,
-            courses=loop.courses.ends,
+            courses=loop.courses.standing,
+            next_s=loop.courses.now_s,
             verdicts=tuple(monitor.verdicts()),
             numbers=monitor.numbers(),
             week=weekly.week,
@@ -157,7 +162,7 @@ def state(station: Station) -> View:
         "dv": _plain(None if sample is None else sample.dv),
         "info": _plain(command.info if seen.stepped is seen.controller else None),  # of the names in ``about``
         "operate": list(seen.operate),  # of the names in ``about``
-        "courses": {name: {"ends_in_s": at, "at": value} for name, (at, value) in seen.courses.items()},
+        "courses": {name: _standing(course, seen.next_s) for name, course in seen.courses.items()},
         "bridged": dict(command.bridged),
         "shed": dict(command.shed),
         "unread_s": None if seen.inputs is None else _plain(seen.inputs.unread_s),
@@ -177,6 +182,24 @@ def state(station: Station) -> View:
         "week": {"began": seen.week, **shares(seen.counts)},
         "warnings": station.ending(),
     }
+
+
+def _standing(course: Course, now_s: float) -> View:
+    """A course by its last point, in seconds from the next scan; ``number`` tells it from others of its signal."""
+    ends = {"ends_in_s": float(course.times_s[-1]) - now_s, "at": float(course.values[-1])}
+    return {**ends, "who": course.who, "number": course.number}
+
+
+def courses(station: Station) -> View:
+    """The points of the courses that stand: those to come and the last one before, in seconds from the course's end."""
+    seen, rows = station.snapshot, list[View]()
+    for course in () if seen is None else seen.courses.values():
+        assert seen is not None
+        first = max(0, int(np.searchsorted(course.times_s, seen.next_s, side="right")) - 1)
+        times, values = (course.times_s[first:] - course.times_s[-1]).tolist(), course.values[first:].tolist()
+        row = {"signal": course.signal, "straight": course.straight, "points": list(zip(times, values, strict=True))}
+        rows.append({**row, "who": course.who, "number": course.number})
+    return {"courses": rows}
 
 
 def inputs(station: Station) -> View:
@@ -250,5 +273,6 @@ VIEWS: Mapping[str, Callable[[Station], View]] = {
     "about": about,
     "state": state,
     "inputs": inputs,
+    "courses": courses,
     "picture": _pictured,
 }

@@ -94,10 +94,12 @@ def test_a_simulation_has_the_operate_that_is_asked_for(
 
     assert highest() > 300
     assert highest("--operate", "T_j.high=280", "--operate", "speed=2") == 280
+    assert highest("--operate", "T_j.use=false") == highest("--operate", "T_j.use=0") < 300
     twice = ("T_j.high=280", "--operate", "T_j.high=290")
     for file, value in (
         (steered_file, ("T_j.high=900",)), (steered_file, ("T_j.top=1",)), (pid_file, ("T_j.high=280",)),
         (steered_file, twice), (steered_file, ("T_j.high=900@5",)), (pid_file, ("T_j.high=280@5",)),
+        (steered_file, ("T_j.high=true",)),
     ):  # fmt: skip
         capsys.readouterr()
         assert main(["simulate", str(file), "--sp", "0.5", "--operate", *value]) == 2

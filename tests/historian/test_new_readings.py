@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from loopwright.pipeline.config.exports import ExportParams
 from loopwright.pipeline.config.known import Known
 from loopwright.pipeline.errors import RecordError
 from loopwright.pipeline.historian.analyser_readings import Aligned, of_samples
-from loopwright.pipeline.historian.cleaning.new_readings import new_readings, on_rows, rows_between
+from loopwright.pipeline.historian.cleaning.new_readings import missing_readings, new_readings, on_rows, rows_between
 from loopwright.pipeline.historian.cleaning.tags import Tag, named
 from loopwright.pipeline.historian.export_params import exported, read_and_screen
 from loopwright.pipeline.historian.files.export import Series
@@ -63,6 +64,16 @@ def test_a_reading_belongs_to_the_first_row_that_is_not_before_it() -> None:
     assert rows_between(np.arange(100) % 7 == 3) == 7
 
 
+def test_readings_that_lack_are_counted_and_a_jitter_of_rows_is_none() -> None:
+    rows = np.arange(0, 2_000, 20)
+    fresh = np.zeros(2_000, dtype=np.bool_)
+    fresh[np.delete(rows, [7, 30, 31, 32])] = True
+    assert missing_readings(fresh) == 4
+    late = np.zeros(2_000, dtype=np.bool_)
+    late[rows[:-1] + np.random.default_rng(0).integers(0, 5, len(rows) - 1)] = True
+    assert missing_readings(late) == 0
+
+
 @pytest.mark.parametrize("missing", [False, True])
 def test_screening_keeps_every_row_and_knows_the_new_readings(tmp_path: Path, missing: bool) -> None:
     found = screened(tmp_path, 1_500, missing=missing)
@@ -78,7 +89,14 @@ def test_screening_keeps_every_row_and_knows_the_new_readings(tmp_path: Path, mi
     assert len(rows) <= np.count_nonzero(fresh) + 1  # a held value at the beginning may be one
     assert record.pv[rows, 1] == pytest.approx(read[rows, 1], rel=1e-5)
     kinds = {f.kind for f in found.report.findings}
-    assert "analyser" in kinds
+    said = [f.words for f in found.report.findings if f.kind == "analyser"]
+    assert {f.tag for f in found.report.findings if f.kind == "analyser"} == {NAMES[1]}
+    assert len(said) == 2
+    assert f"{EVERY} rows ({EVERY * PERIOD_S:g} s)" in said[0]
+    late = re.search(r"(\d+) rows? \((\d+) s\)", said[1])
+    assert late is not None
+    assert 0 < int(late[1]) <= 6
+    assert int(late[2]) == PERIOD_S * int(late[1])
     assert not kinds & {"stuck", "saturated", "gaps"}
 
 

@@ -9,7 +9,7 @@ import pytest
 from identified_models import made_signals
 
 from loopwright.pipeline.laws.predictive.operating import entries_of
-from loopwright.pipeline.pictures.loop_picture import History, summary
+from loopwright.pipeline.pictures.loop_picture import History, drawn, summary
 from loopwright.pipeline.pictures.operated_summary import operated_lines
 from loopwright.serving.operating import Operate
 
@@ -70,6 +70,37 @@ def lines(history: History, noise: float = 0.0) -> list[str]:
 
 def numbers(line: str) -> list[float]:
     return [float(n) for n in re.findall(r"(?<![a-z\d])-?\d+\.?\d*", line)]
+
+
+def patches(history: History, plant: object) -> dict[str, set[str]]:
+    """What each panel of the picture shows beside lines of every run, by the signal at its side."""
+    figure = drawn(plant, history, "a run", {})  # type: ignore[arg-type]
+    usual = {"set point", "controlled variable"}
+    return {ax.get_ylabel().split(" ")[0]: {*ax.get_legend_handles_labels()[1]} - usual for ax in figure.axes}
+
+
+def test_the_picture_shows_what_operators_asked_for() -> None:
+    assert patches(steered(), Plant) == {"y0": set(), "u0": set(), "u1": set()}
+    changed = (5, {"y0.track": 0, "y0.low": 0.5, "u0.rest": 0.1, "u0.rest_use": 1, "u1.use": 0, "u0.high": 0.9})
+    assert patches(steered(changed), Plant) == {"y0": {"range"}, "u0": {"range", "resting value"}, "u1": {"out of use"}}
+    line = next(of for of in drawn(Plant, steered(changed), "", {}).axes[0].lines if of.get_label() == "set point")  # type: ignore[arg-type]
+    assert np.isnan(line.get_ydata()).tolist() == [False] * 5 + [True] * (N - 5)
+
+
+class OfTwo(Plant):
+    """A second PV without a set point."""
+
+    signals = made_signals(2, 2)
+    pv_signals = signals.pv
+
+
+def test_the_picture_has_a_variable_that_has_a_range_alone() -> None:
+    history = steered()
+    history.pv = [np.array([1.0, 0.5])] * N
+    assert set(patches(history, OfTwo)) == {"y0", "u0", "u1"}
+    history.entries = entries_of(OfTwo.signals, 2, [], [], {"y1.high": 0.8})
+    history.operate = [Operate(history.entries).default] * N
+    assert patches(history, OfTwo) == {"y0": set(), "y1": {"range"}, "u0": set(), "u1": set()}
 
 
 def test_the_first_move_counts_as_travel() -> None:

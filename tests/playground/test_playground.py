@@ -20,6 +20,7 @@ from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.commands.playground import page_of
 from loopwright.pipeline.errors import PipelineError
 from loopwright.pipeline.files import sha256
+from loopwright.pipeline.playground import about
 from loopwright.pipeline.playground import web_runtime as runtime
 from loopwright.pipeline.playground.site import (
     LOOP,
@@ -31,7 +32,9 @@ from loopwright.pipeline.playground.site import (
     write_folder,
     write_one_file,
 )
+from loopwright.serving import Controller
 
+pytest_plugins = ["course_files"]
 ARTIFACTS = Path(__file__).parents[2] / "artifacts"
 CASE = "reversible_cstr"
 
@@ -49,6 +52,19 @@ def stand_in(tmp_path: Path) -> Path:
     for name in runtime.DIGESTS:
         (folder / name).write_bytes(f"// {name}".encode())
     return folder
+
+
+def test_the_page_has_of_a_law_all_that_its_host_acts_on(
+    previewing: Controller, operated_previewing: Controller
+) -> None:
+    """Without the input ``ahead`` of a law that reads it, no step of that law has all its inputs."""
+    for law, inputs in ((previewing, {"ahead"}), (operated_previewing, {"operate", "fresh", "ahead"})):
+        told, manifest = about._controller(law, None), json.loads(law.manifest.to_json())
+        assert inputs <= set(told["inputs"])
+        acted = re.search(r"ACTED_ON = (\[.*?\])", (LOOP.parent / "controller.mjs").read_text())
+        assert acted is not None
+        for key in json.loads(acted[1]):
+            assert told.get(key) == manifest.get(key), key
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -38,14 +38,15 @@ def source(path: Path) -> list[str]:
     return ["".join(cell["source"]) for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]]
 
 
-def test_there_are_six() -> None:
-    assert len(NOTEBOOKS) == 6
+def test_there_are_seven() -> None:
+    assert len(NOTEBOOKS) == 7
 
 
 @each
 def test_a_notebook_runs(path: Path, tmp_path: Path) -> None:
     """A copy, beside copies of what it reads: it writes nothing into the checkout."""
-    shutil.copytree(ROOT / "examples" / "own_plant", tmp_path / "own_plant")
+    for name in ("own_plant", "operated_plant"):
+        shutil.copytree(ROOT / "examples" / name, tmp_path / name)
     (tmp_path / "notebooks").mkdir()
     copy = Path(shutil.copy(path, tmp_path / "notebooks"))
     tool = [sys.executable, str(ROOT / "tools" / "run_notebooks.py"), str(copy)]

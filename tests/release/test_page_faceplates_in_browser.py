@@ -194,6 +194,11 @@ def test_every_faceplate_and_field_has_a_name_for_a_screen_reader(page: Page) ->
     assert page.get_by_role("group", name="y0").count() == 1
 
 
+def test_a_law_that_takes_no_course_has_no_part_for_it(page: Page) -> None:
+    expect(page.locator("#courses")).to_be_hidden()
+    expect(page.locator('[data-chart="y0"]')).to_have_attribute("data-course", "0")
+
+
 def test_speed_and_caution_of_the_whole_law(page: Page, steered: Steered) -> None:
     loop, _ = steered
     page.click('[data-change="law"]')

@@ -75,6 +75,18 @@ def test_both_kinds_of_model_are_told_where_a_load_wanders(
     assert (found.predicted != FREE_RUN) is wanders  # the figures of the table are of that kind too
 
 
+def test_the_lateness_of_an_analyser_is_told_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    part = {**PART, "late": {"y0": 0, "y1": 7}}
+    models = {"identified": {"parts": {"identified": {"kind": "identified", "per_seed": {"0": part}}}}}
+    found = model_section(SimpleNamespace(case=two_lags(), models=models))  # type: ignore[arg-type]
+    assert found is not None
+    told = [line for line in found.verdicts if "analyser" in line]
+    assert len(told) == 1
+    assert told[0].startswith("y1 ")
+    assert "7 periods (7 s)" in told[0]
+
+
 @pytest.mark.parametrize("certain", [True, False])
 def test_a_gain_that_changed_is_told_with_its_last_value(
     certain: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

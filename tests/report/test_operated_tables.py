@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -33,6 +34,8 @@ from loopwright.pipeline.pictures.operated_pictures import operated_picture
 from loopwright.pipeline.report.operated_tables import HASTY_TRAVEL, operated_rows, operated_tables
 from loopwright.pipeline.report.page import write_report
 from loopwright.pipeline.report.verdicts import judge, validation
+from loopwright.pipeline.tracking.card import version_description
+from loopwright.pipeline.tracking.gate import Gate
 from loopwright.pipeline.tracking.notes import headline
 
 RANGE = RangeResult("y0", "m", -0.5, 0.5, 3.0, 0.1, 0.02, 0.01, 0.3, 0.01, 0.0)
@@ -199,3 +202,20 @@ def test_leaderboard_and_tracking_have_the_same_figures() -> None:
     points = headline("validate", json.loads(Path("metrics.json").read_text()), again)
     assert points["operated/night/outside_late"] == pytest.approx(0.02)
     assert points["operated/night/gain"] == pytest.approx(0.8)
+
+
+def test_the_registry_shows_the_picture_of_the_test_that_ends_outside_its_ranges_longest() -> None:
+    tests = {
+        "night": result(RANGE),
+        "day": result(replace(RANGE, late=0.5)),
+        "undrawn": result(replace(RANGE, late=0.9)),
+    }
+    found = evidence(tests)
+    tree = validation(found, judge(found, PLAIN))
+    drawn = {name: f"operated/operated_predictive_{name}.png" for name in ("night", "day")}
+    gate = Gate.of(tree, "predictive")
+    card = version_description(tree, gate, "run", "closed_loop.png", operated=drawn)
+    assert re.findall(r"path=([\w/.]+)", card) == ["closed_loop.png", drawn["day"]]
+    assert re.findall(r"path=([\w/.]+)", version_description(tree, gate, "run", "closed_loop.png")) == [
+        "closed_loop.png"
+    ]

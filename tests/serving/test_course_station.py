@@ -2,65 +2,32 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from fake_loop import FakeLoop
+from still_station import StillPlant, settings_of
 
 from loopwright.pipeline.__main__ import main
 from loopwright.serving import Controller, LoopError, Sample, VirtualClock
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command
-from loopwright.serving.opcua.sampling import Values
-from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.preview.course_file import courses_of
 from loopwright.serving.station import station
 from loopwright.serving.station.build_loop import control_loop
 from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.requests import Request, change
-from loopwright.serving.station.settings import JournalSettings, Settings
+from loopwright.serving.station.settings import JournalSettings
 from loopwright.serving.station.station import Station
-from loopwright.serving.station.views import about, state
+from loopwright.serving.station.views import about, courses, state
 
 pytest_plugins = ["small_laws", "operated_files", "course_files"]
-SERVER = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
 COURSE = {"points": {"y0": [[2, 0.5]], "d0": [[0, 0.0], [3, 0.2]], "y1": [[50, 1.0]]}}
-
-
-def settings_of(controller: Controller, **changed: Any) -> Settings:
-    m = controller.manifest
-    nodes = {g: {s.name: f"ns=2;s={s.name}" for s in m.signals(g)} for g in ("pv", "dv", "mv")}
-    return Settings(controller.path, SERVER, Nodes(**nodes), start="MANUAL", **changed)
-
-
-class StillPlant:
-    """In the place of the endpoint: it stands still and reads back what was written."""
-
-    def __init__(self, *_: Any, **__: Any) -> None:
-        self.trouble, self.connections, self.connected = "", 1, True
-        self.mv, self.asked_sp = np.zeros(2), dict[str, float]()
-
-    @property
-    def values(self) -> Values:
-        return Values(0.0, np.zeros(2), self.mv, np.zeros(1), 0.0, "", (), asked_sp=self.asked_sp)
-
-    def start(self) -> None:
-        """Nothing: it is there."""
-
-    def serve(self, law: Any) -> None:
-        """Nothing."""
-
-    def close(self) -> None:
-        """Nothing."""
-
-    def read(self) -> Sample:
-        return Sample(np.zeros(2), self.mv, dv=np.zeros(1))
-
-    def write(self, mv: np.ndarray) -> None:
-        self.mv = mv.copy()
 
 
 @pytest.fixture
@@ -107,7 +74,10 @@ def test_a_course_is_followed_written_down_and_shown(made: Station) -> None:
         "change loop: the course of d0 is over ()",
     ]
     shown = state(made)["courses"]
-    assert shown == {"y1": {"ends_in_s": 43.0, "at": 1.0}}
+    assert shown == {"y1": {"ends_in_s": 43.0, "at": 1.0, "who": "anna", "number": 3}}
+    assert courses(made)["courses"] == [
+        {"signal": "y1", "straight": False, "points": [(0.0, 1.0)], "who": "anna", "number": 3}
+    ]
     assert about(made)["ahead"]["horizon"] == 12
 
 
@@ -161,6 +131,63 @@ def test_a_request_that_cannot_be_is_one_clear_error(previewing: Controller, val
     with pytest.raises(LoopError) as error:
         change(Request.read({"do": "course", "value": value, "who": "anna"}), loop, lambda f, s: Controller(f))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("value", "entry"),
+    [
+        ({"points": {"y1": [[5, 0.1], [9, 0.2]], "y0": [[0, 0.5], [4, 9.0]]}}, "y0.2"),
+        ({"points": {"y0": [[5, 0.5], [4, 0.5], [3, 9.0]]}}, "y0.2"),
+        ({"points": {"d0": [[5, 0.5], [7, -99.0]]}}, "d0.2"),
+        ({"points": {"y0": [[0, 0.5], [3, None]]}}, "y0.2"),
+        ({"points": {"y0": [[0, 0.5], "soon"]}}, "y0.2"),
+        ({"points": {"y0": [[-9, 0.5], [-2, 0.5]]}}, "y0.2"),
+        ({"points": {"y7": [[5, 0.5]]}}, ""),
+        ({"csv": "time,y0\n5,9.0\n"}, "csv"),
+        ({"csv": "time,y0\nsoon,0.5\n"}, "csv"),
+        ({"csv": "time,y7\n5,0.5\n"}, "csv"),
+        ({"csv": "time,y0\n5,0.5\n", "straight": ["y1"]}, "csv"),
+        ({"csv": ""}, "csv"),
+        ({"csv": 5}, ""),
+        ({"csv": "time,y0\n5,0.5\n", "points": {"y0": [[0, 0.5]]}}, ""),
+    ],
+    ids=str,
+)
+def test_a_refusal_names_the_point_or_the_file_apart_from_its_words(
+    previewing: Controller, value: Any, entry: str
+) -> None:
+    loop = control_loop(settings_of(previewing), previewing, mv=[0.0, 0.0])
+    with pytest.raises(LoopError) as error:
+        change(Request.read({"do": "course", "value": value, "who": "anna"}), loop, lambda f, s: Controller(f))
+    assert error.value.entry == entry
+    assert loop.courses.standing == {}
+
+
+def test_the_text_of_a_file_gives_courses_and_its_dates_are_the_clocks(made: Station) -> None:
+    far = datetime.fromtimestamp(time.time() + 3600.0, UTC)
+    text = f"\ufefftime,y0,d0\r\n0,,0\r\n900,0.5,0.2\r\n{far.isoformat()},0.25,\r\n"
+    ran(made, 3, s0=asked(made, "course", {"csv": text, "straight": ["y0"]}))
+    assert made.loop is not None
+    found = made.loop.courses.standing
+    assert {name: (of.straight, of.who) for name, of in found.items()} == {"y0": (True, "anna"), "d0": (True, "anna")}
+    assert found["y0"].values[-2:].tolist() == [0.5, 0.25]
+    assert found["y0"].times_s[-1] == pytest.approx(3600.0, abs=60.0)
+
+
+def test_a_date_of_a_loop_that_outruns_the_clock_is_as_much_further_away() -> None:
+    text = "time,y0\n2026-03-01T14:30,0.5\n7200,0.6\n"
+    now = datetime(2026, 3, 1, 14, 0, tzinfo=UTC).timestamp()
+    assert courses_of(text, now, "recipe.csv") == {"y0": [(1800.0, 0.5), (7200.0, 0.6)]}
+    assert courses_of(text, now, "recipe.csv", speed=4.0) == {"y0": [(7200.0, 0.5), (7200.0, 0.6)]}
+
+
+def test_the_points_that_are_shown_are_those_to_come_and_the_one_that_holds(made: Station) -> None:
+    assert courses(made) == {"courses": []}  # before the first scan
+    long = {"points": {"y0": [[0, 0.1], [1, 0.2], [3, 0.3], [90, 0.4], [100, 0.5]]}}
+    ran(made, 8, s0=asked(made, "course", long))
+    (row,) = courses(made)["courses"]
+    assert row["points"] == [(-97.0, 0.3), (-10.0, 0.4), (0.0, 0.5)]  # from the course's own end
+    assert state(made)["courses"]["y0"]["ends_in_s"] == 93.0
 
 
 def test_a_law_that_does_not_read_it_is_one_clear_error(operated: Controller) -> None:

@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 from loopwright.serving import Controller, ControlLoop, LoopError, Mode, Sample, VirtualClock
+from loopwright.serving.preview import course
+from loopwright.serving.preview.ahead import AheadInput
 from loopwright.serving.preview.course import MOST_COURSE_POINTS, Courses
+from loopwright.serving.preview.differences import Differences
 
 pytest_plugins = ["small_laws", "operated_files", "course_files"]
 N, PERIOD = 12, 1.0
@@ -150,6 +153,27 @@ def test_another_controller_gets_its_own_horizon(previewing: Controller, operate
     assert known is not None
     assert known.shape == (45,)
     assert known[-3] == 1.0
+
+
+def test_the_ranges_of_a_laws_input_are_looked_up_once_and_not_at_each_scan(
+    previewing: Controller, operated_previewing: Controller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[AheadInput] = []
+
+    class Counted(Differences):
+        def __init__(self, ahead: AheadInput) -> None:
+            made.append(ahead)
+            super().__init__(ahead)
+
+    monkeypatch.setattr(course, "Differences", Counted)
+    loop = loop_of(previewing)
+    loop.set_course({"y1": [(90, 1.0)]})
+    sps(loop, 5)
+    assert [of.horizon for of in made] == [12]
+    loop.swap(operated_previewing, 3)  # both laws are stepped
+    sps(loop, 9)
+    assert loop.controller is operated_previewing
+    assert [of.horizon for of in made] == [12, 15]
 
 
 # --------------------------------------------------------------------------------------------------------- refusals

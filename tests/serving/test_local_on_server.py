@@ -9,95 +9,50 @@ from typing import Any
 
 import pytest
 from asyncua import ua
-from asyncua.sync import Server as SyncServer
-from plant_servers import RunningLoop, free_port
+from plant_servers import RunningLoop
 from processes import within
+from written_nodes import SPACE, WrittenNodes, loop_settings, written_nodes
 
 from loopwright.serving import Controller, LoopError, Mode
 from loopwright.serving.opcua.inspection import inspected
-from loopwright.serving.opcua.settings import LocalNode, Nodes, Server
-from loopwright.serving.station.settings import Guards, JournalSettings, Local, Settings
+from loopwright.serving.opcua.settings import LocalNode, Point
+from loopwright.serving.station.settings import Local, Settings
 
 pytest_plugins = ["small_laws", "operated_files"]
-START = {"T": 300.0, "p": 5.0, "x": 0.5, "valve": 40.0, "heat": 0.5, "back": 40.0, "word": "CAS", "number": 1}
-SPACE = "nsu=urn:test:plant;s="
 BY = {"word": LocalNode(f"{SPACE}word", local=("MAN", "IMAN")), "number": LocalNode(f"{SPACE}number", remote=(1.0,))}
 
 
-class LocalServer:
-    """Nodes that hold what the test writes; the valve is read back by a node of its own."""
-
-    def __init__(self) -> None:
-        self.endpoint = f"opc.tcp://127.0.0.1:{free_port()}"
-        self.server = SyncServer()
-        self.server.set_endpoint(self.endpoint)
-        space = self.server.register_namespace("urn:test:plant")
-        self.nodes = {}
-        for name, value in START.items():
-            node = self.server.nodes.objects.add_variable(ua.NodeId(name, space), name, value)
-            node.set_writable()
-            self.nodes[name] = node
-        self.server.start()
-
-    def write(self, name: str, value: Any, status: int = ua.StatusCodes.Good) -> None:
-        kind = {str: ua.VariantType.String, int: ua.VariantType.Int64}.get(type(value), ua.VariantType.Double)
-        self.nodes[name].write_value(ua.DataValue(ua.Variant(value, kind), ua.StatusCode(status)))
-
-    def has(self, name: str) -> Any:
-        return self.nodes[name].read_value()
-
-
 @pytest.fixture
-def server() -> Iterator[LocalServer]:
-    made = LocalServer()
-    yield made
-    RunningLoop.end_all()
-    made.server.stop()
+def nodes() -> Iterator[WrittenNodes]:
+    with written_nodes() as made:
+        yield made
 
 
-def settings_of(server: LocalServer, controller: Controller, folder: Path, by: str, **changed: Any) -> Settings:
-    groups: Any = {g: {s.name: SPACE + s.name for s in controller.manifest.signals(g)} for g in ("pv", "mv")}
-    groups["mv"]["valve"] = {"node": f"{SPACE}valve", "read_back": f"{SPACE}back"}
-    points = {g: {n: _point(p) for n, p in group.items()} for g, group in groups.items()}
-    made = Settings(
-        controller.path,
-        Server(server.endpoint, security="None", insecure=True, source_time="ignore"),
-        Nodes(**points, local={"valve": BY[by]}, lease="none"),
-        start="AUTO",
-        accept_unproven=True,
-        speed=5.0,  # periods of .2 s
-        guards=Guards(max_age_s=50.0),
-        local=Local(0.0),
-        journal=JournalSettings(folder / "loop.journal"),
-    )
-    return replace(made, **changed)
-
-
-def _point(given: Any) -> Any:
-    from loopwright.serving.opcua.settings import Point
-
-    return Point(**given) if isinstance(given, dict) else given
+def settings_of(nodes: WrittenNodes, controller: Controller, folder: Path, by: str) -> Settings:
+    """The valve is read back by a node of its own, and a node says whether the plant has it."""
+    mv = {"valve": Point(f"{SPACE}valve", read_back=f"{SPACE}back"), "heat": f"{SPACE}heat"}
+    return loop_settings(nodes, controller, folder, {"mv": mv, "local": {"valve": BY[by]}}, local=Local(0.0))
 
 
 @pytest.mark.parametrize(("by", "theirs", "ours"), [("word", "man", "CAS"), ("number", 0, 1)])
 def test_the_plant_takes_an_mv_and_gives_it_back(
-    server: LocalServer, operated: Controller, tmp_path: Path, by: str, theirs: Any, ours: Any
+    nodes: WrittenNodes, operated: Controller, tmp_path: Path, by: str, theirs: Any, ours: Any
 ) -> None:
-    running = RunningLoop(settings_of(server, operated, tmp_path, by))
+    running = RunningLoop(settings_of(nodes, operated, tmp_path, by))
     running.becomes(Mode.AUTO, scans=3)
-    server.write(by, theirs)
+    nodes.write(by, theirs)
     assert within(20, lambda: list(running.commands[-1].local) == ["valve"])
-    server.write("back", 63.0)
-    assert within(20, lambda: server.has("valve") == 63.0)  # what the loop writes follows
+    nodes.write("back", 63.0)
+    assert within(20, lambda: nodes.has("valve") == 63.0)  # what the loop writes follows
     assert running.commands[-1].mode is Mode.AUTO
     with pytest.raises(LoopError, match="valve"):
         running.does("mv", {"valve": 50.0})
     assert within(20, lambda: any("MV valve is out" in line for line in running.events()))
-    server.write("T", 290.0)  # ten below its set point: the law wants the valve up
+    nodes.write("T", 290.0)  # ten below its set point: the law wants the valve up
     before = len(running.commands)
     assert within(20, lambda: len(running.commands) > before + 3)
-    assert server.has("valve") == 63.0
-    server.write(by, ours)
+    assert nodes.has("valve") == 63.0
+    nodes.write(by, ours)
     assert within(20, lambda: not running.commands[-1].local)
     first = next(c for c in running.commands[before:] if not c.local)
     assert 63.0 <= first.mv[0] <= 68.0
@@ -106,44 +61,44 @@ def test_the_plant_takes_an_mv_and_gives_it_back(
 
 
 def test_a_bad_read_back_stops_no_loop_and_an_mv_in_hand_goes_where_it_is_sent(
-    server: LocalServer, operated: Controller, tmp_path: Path
+    nodes: WrittenNodes, operated: Controller, tmp_path: Path
 ) -> None:
-    running = RunningLoop(settings_of(server, operated, tmp_path, "word"))
+    running = RunningLoop(settings_of(nodes, operated, tmp_path, "word"))
     running.becomes(Mode.AUTO, scans=3)
-    server.write("back", 40.0, ua.StatusCodes.BadNoCommunication)
+    nodes.write("back", 40.0, ua.StatusCodes.BadNoCommunication)
     assert within(20, lambda: list(running.commands[-1].local) == ["valve"])
     assert running.commands[-1].mode is Mode.AUTO
-    server.write("back", 40.0)
+    nodes.write("back", 40.0)
     assert within(20, lambda: not running.commands[-1].local)
     with pytest.raises(LoopError, match="valve"):
         running.does("mv", {"valve": 47.0})
     running.does("operate", {"valve.use": False})
     assert running.does("mv", {"valve": 47.0}).startswith("MV valve 40 -> 47")
-    assert within(20, lambda: server.has("valve") == 47.0)
+    assert within(20, lambda: nodes.has("valve") == 47.0)
     assert running.commands[-1].mode is Mode.AUTO
     running.end()
 
 
 def test_a_status_that_cannot_be_read_leaves_the_mv_as_it_was(
-    server: LocalServer, operated: Controller, tmp_path: Path
+    nodes: WrittenNodes, operated: Controller, tmp_path: Path
 ) -> None:
-    running = RunningLoop(settings_of(server, operated, tmp_path, "word"))
+    running = RunningLoop(settings_of(nodes, operated, tmp_path, "word"))
     running.becomes(Mode.AUTO, scans=3)
     for word, local in (("CAS", []), ("MAN", ["valve"])):
-        server.write("word", word)
+        nodes.write("word", word)
         assert within(20, lambda local=local: list(running.commands[-1].local) == local)  # type: ignore[misc]
-        server.write("word", "", ua.StatusCodes.BadNoCommunication)
+        nodes.write("word", "", ua.StatusCodes.BadNoCommunication)
         before = len(running.commands)
         assert within(20, lambda before=before: len(running.commands) > before + 3)  # type: ignore[misc]
         assert list(running.commands[-1].local) == local
     running.end()
 
 
-def test_the_check_shows_whose_each_mv_is(server: LocalServer, operated: Controller, tmp_path: Path) -> None:
+def test_the_check_shows_whose_each_mv_is(nodes: WrittenNodes, operated: Controller, tmp_path: Path) -> None:
     notes = []
     for word in ("CAS", "MAN"):
-        server.write("word", word)
-        made = settings_of(server, operated, tmp_path, "word")
+        nodes.write("word", word)
+        made = settings_of(nodes, operated, tmp_path, "word")
         rows = {r.signal: r for r in inspected(operated.manifest, made.server, made.nodes, 0.05).rows}
         assert (rows["local valve"].wrong, rows["local valve"].value) == ("", word)
         notes.append(rows["local valve"].note)
@@ -152,9 +107,9 @@ def test_the_check_shows_whose_each_mv_is(server: LocalServer, operated: Control
 
 # --------------------------------------------------------------------------------------------------------- a restart
 def test_a_restart_says_what_operators_had_set_and_takes_it_back_where_it_is_told_to(
-    server: LocalServer, operated: Controller, tmp_path: Path
+    nodes: WrittenNodes, operated: Controller, tmp_path: Path
 ) -> None:
-    settings = settings_of(server, operated, tmp_path, "word")
+    settings = settings_of(nodes, operated, tmp_path, "word")
     running = RunningLoop(settings)
     running.does("operate", {"valve.high": 77.0, "T.use": 0})
     running.does("sp", {"p": 6.0})

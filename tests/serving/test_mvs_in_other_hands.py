@@ -17,6 +17,7 @@ from loopwright.serving import Controller, ControlLoop, LoopError, Mode, Sample
 from loopwright.serving.modes import Fallback
 from loopwright.serving.monitor.signal_use import UseOfSignals
 from loopwright.serving.opcua.analysers import Analysers
+from loopwright.serving.opcua.settings import AnalyserNode
 from loopwright.serving.station.control import LONGEST_REQUEST, asked
 from loopwright.serving.station.last_run import Steered
 
@@ -109,7 +110,7 @@ def test_an_mv_that_the_plant_has_is_not_moved_for_the_monitor(operated: Control
 
 
 def test_a_bad_status_between_two_results_of_an_analyser_is_no_fault(operated: Controller) -> None:
-    analysers = Analysers(operated.manifest, {"x": 100.0})
+    analysers = Analysers(operated.manifest, {"x": AnalyserNode(100.0)})
     found = []
     for k, bad in ((0, ""), (1, "bad"), (2, ""), (150, "bad")):
         given = replace(sample(), bad_pv=("", "", bad) if bad else ())

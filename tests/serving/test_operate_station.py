@@ -23,7 +23,7 @@ from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.plan import NodePlan
 from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
-from loopwright.serving.opcua.settings import Nodes, Point, Server
+from loopwright.serving.opcua.settings import AnalyserNode, Nodes, Point, Server
 from loopwright.serving.opcua.values import NodeReading
 from loopwright.serving.station import station
 from loopwright.serving.station.build_loop import control_loop
@@ -390,3 +390,30 @@ def test_an_analyser_that_cannot_be_is_refused(operated: Controller, not_operate
     for analysers, of in (({"y": 9.0}, operated), ({"x": 0.0}, operated), ({"x": 9.0}, not_operated)):
         with pytest.raises(LoopError, match=r"nodes\.analysers"):
             Nodes(**NODES, analysers=analysers).check(of.manifest)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("x = 1800", AnalyserNode(1800.0)),
+        ("x = { longest_s = 60.5 }", AnalyserNode(60.5)),
+        ('x = { longest_s = 1800, new = "source_time" }', AnalyserNode(1800.0, "source_time")),
+        ('x = { longest_s = 1800, new = "stamp" }', None),
+        ("x = { longest_s = 0 }", None),
+        ('x = "half an hour"', None),
+        ('x = { new = "number" }', None),
+    ],
+)
+def test_loop_toml_names_an_analyser_by_a_time_or_by_a_table(
+    operated: Controller, tmp_path: Path, line: str, expected: AnalyserNode | None
+) -> None:
+    path = tmp_path / "loop.toml"
+    path.write_text(
+        f'controller = "{operated.path}"\n[server]\nendpoint = "opc.tcp://127.0.0.1:1"\nsecurity = "None"\n'
+        f"insecure = true\n[nodes.pv]\n[nodes.mv]\n[nodes.analysers]\n{line}\n"
+    )
+    if expected is not None:
+        assert Settings.read(path).nodes.results() == {"x": expected}
+    else:
+        with pytest.raises(LoopError, match="analysers"):
+            Settings.read(path)

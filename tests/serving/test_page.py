@@ -131,10 +131,14 @@ def test_only_a_request_of_the_page_itself_with_the_token_changes_anything(
         got, answer = browser.change(wanted, **changed)  # type: ignore[arg-type]
         assert got == status, (changed, answer)
         assert answer["error"]
-    assert browser.change(b"x" * 20_000)[0] == 413
+    assert browser.change(b"x" * 200_000)[0] == 413
+    assert browser.change(b"x" * 20_000)[0] == 400  # a course's file may be so long
+    own = {"Content-Type": "application/json", "Origin": f"http://127.0.0.1:{port}"}
+    assert browser.send("POST", "/api/what-if", b"x" * 20_000, own)[0] == 413  # which asks for no token
     assert browser.change(b"{")[0] == 400
     assert browser.change(b"[" * 5_000)[0] == 400
-    assert browser.change({"do": "state"})[0] == 400
+    for view in ("state", "about", "inputs", "courses", "picture"):
+        assert browser.change({"do": view})[0] == 400
     assert browser.get("/api/change")[0] == 405
     assert browser.get("/", Host="evil.example")[0] == 421
     assert browser.get("/api/state", Host="evil.example")[0] == 421

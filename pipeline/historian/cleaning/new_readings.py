@@ -23,6 +23,9 @@ LEAST_NEW = 30  # of an analyser: a model of its own needs some for each number
 NOT_SELDOM = 0.5  # share of the rows from which new readings are no seldom ones: then the tag is a pv like others
 STORED = 0.5  # share of the cells that hold a value from which an archive repeats the last one
 STEPS_WITHOUT = 1.5  # steps of the clock between two values: more is a time without any
+LACKS_FROM = (
+    1.5  # usual times between two new readings: from there on the nearest whole number of them tells how many lack
+)
 
 
 def new_readings(series: Series, step_s: float) -> Series:
@@ -67,6 +70,15 @@ def rows_between(fresh: NDArray[np.bool_]) -> int:
     return max(1, round(float(np.median(gaps)))) if gaps.size else 1
 
 
+def missing_readings(fresh: NDArray[np.bool_]) -> int:
+    """The new readings that lack between others, of rows (n,) with one every ``rows_between`` rows as a rule.
+
+    An archive that repeats the last number does not show one that is equal to it: it lacks, too.
+    """
+    times = np.diff(np.flatnonzero(fresh)) / rows_between(fresh)
+    return int(np.sum(np.rint(times[times >= LACKS_FROM]) - 1))
+
+
 def put_analysers(grid: Grid, analysers: Sequence[Tag], own: Mapping[str, Series]) -> list[Finding]:
     """Put the analysers' new readings ``own`` into the grid, and the rows that have one; what was seen of them.
 
@@ -88,8 +100,9 @@ def put_analysers(grid: Grid, analysers: Sequence[Tag], own: Mapping[str, Series
             )
         grid.put(tag.tag, value, fresh)
         usual, longest = rows_between(fresh), int(np.diff(np.flatnonzero(fresh)).max())
-        words = f"{counted(n, 'new reading')}, one every {counted(usual, 'row')} as a rule; no row between them counts"
-        if longest > 2 * usual:
-            words += f"; the longest time without one is {longest} rows"
+        times = [f"{counted(of, 'row')} ({of * grid.period_s:g} s)" for of in (usual, longest)]
+        words = f"{counted(n, 'new reading')}, one every {times[0]} as a rule; no row between them counts"
+        if lacking := missing_readings(fresh):
+            words += f"; {lacking} lack or equal the one before; the longest time without one is {times[1]}"
         found.append(Finding("analyser", tag.tag, words))
     return found

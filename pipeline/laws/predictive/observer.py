@@ -35,6 +35,7 @@ class Noises:
     outputs: float
     loads: Tensor | float  # (n_y,), as each output sees it, or one for all
     jumps: float = 1.0  # share of BOOST that a load moves by then
+    changes: Tensor | None = None  # (n_d,) scaled, of the loads beside those: as the record's changed
 
 
 def load_variance(model: Identified) -> Tensor:
@@ -61,7 +62,8 @@ class Observer(nn.Module):
         x+ = f(x, v + V d) + X d + w,   d+ = d + n,   y = x[:n_y] + e
 
     w has the variance q_x R in the rows of the outputs, e has R, the square of the model's noise, and n has q_d
-    R, R of the outputs that a load moves. A load passes the plant's poles, unlike an error that is added to the output,
+    R, R of the outputs that a load moves, and beside it the variance of the loads' changes in the record, where the
+    law takes its loads from there. A load passes the plant's poles, unlike an error that is added to the output,
     and a load at an MV all its lags and dead times. The filter is the extended Kalman filter, whose correction takes
     the outputs one after another.
 
@@ -119,6 +121,8 @@ class Observer(nn.Module):
         r = torch.clamp(model.noise, min=NOISE_FLOOR) ** 2
         q = torch.zeros(n_a, dtype=torch.float64)
         q[: self.n_y], q[n_x:] = noises.outputs * r, (noises.loads * r) @ loads.share
+        if noises.changes is not None:
+            q[n_x:] += noises.changes
         q_load = torch.cat([torch.zeros(n_x, dtype=torch.float64), q[n_x:]])
         place = torch.zeros(self.n_y, n_a, n_a, dtype=torch.float64)
         for i in range(loads.count):

@@ -32,7 +32,9 @@ class PredictiveParams:
     the plant's; None: all 1. ``q_x`` and ``q_d`` > 0: variance of the model's error and of the load's change a period,
     in units of the noise's; q_d None: 3e-5 over the noise. ``jumps`` > 0: share of the observer's jump after a step of
     a load; less calms loops over a plant that is not the model. ``loads`` act on the ``mvs``, where
-    there are as many as outputs, or else on the ``outputs``.
+    there are as many as outputs, or else on the ``outputs``; ``record``: on the outputs, and each changes
+    as much as in the record; None: ``record`` of a law with ``operate`` whose model was identified with its
+    loads, else ``mvs``.
     ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or more; None: .5 of
     one MV, .25 of several, and with a search the least that the loops stand. ``tuning``: ``given`` takes these numbers,
     ``search`` starts from them and chooses speed, caution, horizon and jumps in closed loops over the model with errors
@@ -57,7 +59,7 @@ class PredictiveParams:
     q_x: float = 0.01
     q_d: float | None = None
     jumps: float = 1.0
-    loads: Where = "mvs"
+    loads: Literal["mvs", "outputs", "record"] | None = None
     damping: float | None = None
     passes: int = 2
     sweeps: int = 4
@@ -74,10 +76,15 @@ class PredictiveParams:
             given = getattr(self, name)
             if given is not None and not 0 < given < np.inf:
                 raise ValueError(f"{name} is {given}; it must be above 0, and finite")
-        words = {"loads": ("mvs", "outputs"), "tuning": ("given", "search"), "preview": ("held", "ramp", "course")}
-        for name, allowed in words.items():
+        choices: dict[str, tuple[str | None, ...]] = {
+            "loads": (None, "mvs", "outputs", "record"),
+            "tuning": ("given", "search"),
+            "preview": ("held", "ramp", "course"),
+        }
+        for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
-                raise ValueError(f"{name} is {getattr(self, name)!r}; allowed are {', '.join(allowed)}")
+                words = ", ".join(word for word in allowed if word)
+                raise ValueError(f"{name} is {getattr(self, name)!r}; allowed are {words}")
         if self.damping is not None and not 0 <= self.damping < np.inf:
             raise ValueError(f"damping is {self.damping}; it must be 0 or above, and finite")
         for name, least in (("horizon", 8), ("moves", 1), ("passes", 1), ("sweeps", 1)):
@@ -104,6 +111,16 @@ def weights_of(signals: Signals, params: PredictiveParams) -> tuple[float, ...]:
     if len(weights) != len(signals.sp):
         raise LawError(f"law 'predictive' has {len(weights)} weights; give one for each set point ({_names(signals)})")
     return weights
+
+
+def loads_at(model: Identified, params: PredictiveParams) -> Where:
+    """Where the law's loads act, and as the record's, by ``loads``; LawError for those of a record without them."""
+    if params.loads == "record" and not model.recorded:
+        raise LawError(
+            "law 'predictive': loads is 'record', and the model was identified without the loads of its record; "
+            "leave `loads` out, or choose mvs or outputs"
+        )
+    return params.loads or ("record" if params.operate is not None and model.recorded else "mvs")
 
 
 def limits_of(signals: Signals, params: PredictiveParams) -> tuple[Array, Array] | None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
 from loopwright.pipeline.laws.predictive.cold_rest import bent_rest, cold_start, held_rest
-from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, loads_of
+from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, loads_of, recorded_changes
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
 from loopwright.pipeline.laws.predictive.horizon_check import AnswerTimes, horizon_for, mvs_of, refuse_unstable
 from loopwright.pipeline.laws.predictive.known_future import KnownFuture, ahead_of
@@ -21,6 +21,7 @@ from loopwright.pipeline.laws.predictive.params import (
     PredictiveParams,
     check_sizes,
     limits_of,
+    loads_at,
     refuse_discrete,
     weights_of,
 )
@@ -100,9 +101,12 @@ class Predictive(ControlLaw):
         move = params.move_weight / params.speed**2 * (horizon - dead) / 10
         damping = (0.5 if n_mv == 1 else 0.25) if params.damping is None else params.damping
         cost = Cost(weights, move, params.eps, damping)
-        loads = loads_of(model, params.loads, horizon)
+        where = loads_at(model, params)
+        loads = loads_of(model, where, horizon)
         self.q_d = load_variance(model) if params.q_d is None else torch.full((model.n_y,), params.q_d).double()
-        self.observer = Observer(model, loads, Noises(params.q_x, self.q_d / params.caution**2, params.jumps))
+        changes = recorded_changes(model) / params.caution**2 if where == "record" else None
+        noises = Noises(params.q_x, self.q_d / params.caution**2, params.jumps, changes)
+        self.observer = Observer(model, loads, noises)
         rate = None if self.rate is None else self.rate / half
         # With `operate` further PVs that the model has as outputs have ranges, too.
         n_o = n_cv if params.operate is None else model.n_y

@@ -148,6 +148,11 @@ class Planner(nn.Module):
     ) -> None:
         super().__init__()
         self.valleys = valleys  # more MVs than set points: a step along the cost's flat directions beside the sweeps
+        # Of such a law later moves come first within operators' bounds: the first move, which acts, is then the best
+        # beside all others as they end. In the other order the first MV took what a range asked for, sample after
+        # sample, and the last one stayed: three valves went to their ends together, and a set point within a range
+        # that was narrowed was not reached.
+        self.order = range(moves.count - 1, -1, -1) if valleys else range(moves.count)
         self.limits = limits
         self.horizon, self.passes, self.sweeps, self.m = horizon, passes, sweeps, moves.count
         self.n_cv = len(cost.weights)
@@ -303,7 +308,7 @@ class Planner(nn.Module):
         t = (plan - middle) / size
         for sweep in range(self.sweeps):
             before = t
-            for p in range(m):
+            for p in self.order:
                 t = hardtanh(product(t, into[p], add[p]))
             if self.valleys and sweep == self.sweeps - 2:
                 t = hardtanh(t + self._along_valley(curvature, pull, middle + half * t, half, t, t - before))
@@ -331,13 +336,14 @@ class Planner(nn.Module):
         c = self.eye * (pull / diagonal)
         into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
         add = torch.split(c, 1, dim=-2)
+        order = range(m) if bounds is None else self.order
         for _ in range(self.sweeps):
             if bounds is None and self.rate is None:
-                for p in range(m):
+                for p in order:
                     plan = hardtanh(product(plan, into[p], add[p]))
                 continue
             low, high = self.ends(product(plan, self.before, at), bounds)
-            for p in range(m):
+            for p in order:
                 plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
         return plan
 

@@ -11,7 +11,7 @@ import numpy as np
 from loopwright.pipeline.engine.progress import steps
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import ControlLaw
-from loopwright.pipeline.laws.predictive.params import PredictiveParams
+from loopwright.pipeline.laws.predictive.params import PredictiveParams, loads_at
 from loopwright.pipeline.laws.predictive.tuning_loops import LoopErrors, TuningLoops, side_by_side
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Signals
@@ -191,7 +191,8 @@ def searched_params(
     Its set points step over the record's range, so its laws know no soft limits and no recipe. The calmer numbers are
     ``CALM_SPEED`` of the speed and ``CALM_JUMPS`` of the jumps.
     """
-    plain = replace(params, cv_low=None, cv_high=None, preview="held", operate=None)
+    loads = loads_at(model, params)  # without `operate` the laws of the search would have others
+    plain = replace(params, cv_low=None, cv_high=None, preview="held", operate=None, loads=loads)
 
     def with_numbers(n: Mapping[str, float], damping: float | None, given: PredictiveParams) -> PredictiveParams:
         numbers: dict[str, Any] = {**n, "horizon": int(n["horizon"]), "damping": damping}

@@ -1,5 +1,6 @@
 // Trends, one chart a signal, with one cursor and one time axis for all.
 import { ABOVE, bands } from "./bands.js";
+import * as courses from "./courses.js";
 import * as foresight from "./foresight.js";
 import { clock, element, number, unit } from "./format.js";
 import * as ranges from "./ranges.js";
@@ -72,6 +73,7 @@ export class Charts {
   }
 
   draw(from, to) {
+    this.to = to;
     for (const { chart, plot } of this.made) {
       const numbers = this.data.of(chart.lines.map((l) => l.column));
       plot.setData(numbers, false);
@@ -147,7 +149,7 @@ export class Charts {
       ],
       hooks: {
         drawClear: [(u) => bands(u, this.data, color), (u) => ranges.draw(u, chart.signal, color)],
-        draw: [(u) => foresight.draw(u, chart.signal, chart.group === "mv" ? "mv" : "pv", color)],
+        draw: [(u) => courses.draw(u, chart.signal, foresight.draw(u, chart.signal, chart.group === "mv" ? "mv" : "pv", color), color)],
         setSelect: [(u) => this.selected(u)],
         setCursor: [(u) => (u.cursor.left < 0 ? newest(u) : u.root.classList.add("reading"))],
         ready: [(u) => this.listen(u.over)],
@@ -166,7 +168,7 @@ export class Charts {
   range(signal, low, high) {
     const known = signal.high !== undefined;
     if (low === null || high === null || (this.whole && known)) return known ? [signal.low, signal.high] : [0, 1];
-    if (known) [low, high] = foresight.near(signal, ...ranges.near(signal, low, high));
+    if (known) [low, high] = courses.near(signal, ...foresight.near(signal, ...ranges.near(signal, low, high)), this.to);
     const least = known ? 0.01 * (signal.high - signal.low) : 1e-9 + 1e-6 * Math.max(Math.abs(low), Math.abs(high));
     const air = Math.max(0.08 * (high - low), (least - (high - low)) / 2, least / 2);
     return [low - air, high + air];

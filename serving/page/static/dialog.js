@@ -10,13 +10,14 @@ let pending = null; // what is asked for now; an answer to an earlier one does n
 
 // title, words: what will change; fields: [{name, label, value, now, unit, min, max, choices}]; request(values): what is
 // sent. A field with `now` is sent only where the operator changed it, so that rounding moves nothing. foresee(values):
-// an element that shows what the values would do, or null.
-export function ask({ title, words, fields = [], request, foresee = null }) {
+// an element that shows what the values would do, or null. In place of fields a `body` may be asked in, an element of which
+// `said()` tells in a line what is given, and `request()` makes what is sent; it throws an error with `entry` where it cannot.
+export function ask({ title, words, fields = [], body = null, said = null, request, foresee = null }) {
   const opener = document.activeElement;
-  pending = { fields, request, foresee, touched: new Set(), opener, place: opener?.closest("section") };
+  pending = { fields, body, said, request, foresee, touched: new Set(), opener, place: opener?.closest("section") };
   $("dialog-title").textContent = title;
   $("dialog-words").textContent = words;
-  $("dialog-fields").replaceChildren(...fields.map(field));
+  $("dialog-fields").replaceChildren(...(body ? [body] : fields.map(field)));
   $("who").value = sessionStorage.getItem("who") || "";
   $("token").value = sessionStorage.getItem("token") || "";
   $("why").value = "";
@@ -49,11 +50,12 @@ const changed = (input) => pending.touched.has(input.dataset.field) || input.val
 
 // The fields that will be sent, each with its input.
 const wanted = () =>
-  inputs()
+  (pending.body ? [] : inputs())
     .map((input, i) => [pending.fields[i], input])
     .filter(([given, input]) => given.now === undefined || changed(input));
 
 function moves() {
+  if (pending.said) return say($("dialog-moves"), pending.said());
   const said = wanted()
     .filter(([given]) => given.now !== undefined)
     .map(([given, input]) => {
@@ -103,7 +105,7 @@ async function confirm(event) {
     said = `Done: ${await change({ ...mine.request(values), ...accepted, who, reason }, token)}`;
   } catch (error) {
     refused = error;
-    said = error.status ? `Not done: ${error.message}` : error.message;
+    said = error.status || error.entry ? `Not done: ${error.message}` : error.message;
   }
   if (refused?.status !== UNAUTHORIZED) sessionStorage.setItem("token", token);
   const open = pending === mine && $("dialog").open;
@@ -114,7 +116,7 @@ async function confirm(event) {
     $("refusal").textContent = unproven
       ? `Not done: not proven in closed loop. ${refused.unproven}. Accept it, and it moves the plant in AUTO all the same; that is written down.`
       : wrong(refused.entry, refused.message)
-        ? `Not done: see ${refused.entry}.`
+        ? `Not done: see ${inputs().find((input) => input.dataset.field === refused.entry).dataset.said || refused.entry}.`
         : said;
     if (refused.status === UNAUTHORIZED) $("token").select();
     return;
@@ -128,7 +130,7 @@ function wrong(name, words, focus = true) {
   let shown = false;
   for (const input of inputs()) {
     const mine = name && input.dataset.field === name;
-    const line = input.parentElement.querySelector(".wrong");
+    const line = $(`wrong-${input.dataset.field}`);
     line.textContent = mine ? words : "";
     for (const [attribute, value] of [["aria-invalid", "true"], ["aria-describedby", line.id]]) {
       if (mine) input.setAttribute(attribute, value);

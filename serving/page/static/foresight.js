@@ -71,14 +71,16 @@ export function near(signal, low, high) {
   return c ? [Math.min(low, ...c.values), Math.max(high, ...c.values)] : [low, high];
 }
 
-// Over the lines of a plot: the course, dashed, right of now.
+const WORD = "prediction";
+
+// Over the lines of a plot: the course, dashed, right of now. Where the word that names it ends; 0 where there is none.
 export function draw(u, signal, kind, color) {
   const c = course(signal);
   const { ctx, bbox } = u;
   const begin = found ? u.valToPos(found.time, "x", true) : Infinity;
   const shown = c && begin < bbox.left + bbox.width - 2;
   u.root.parentElement?.setAttribute("data-ahead", shown ? c.values.length : 0); // for tests, which cannot read a canvas
-  if (!shown) return;
+  if (!shown) return 0;
   ctx.save();
   ctx.beginPath();
   ctx.rect(bbox.left, 0, bbox.width, bbox.top + bbox.height);
@@ -88,7 +90,8 @@ export function draw(u, signal, kind, color) {
   ctx.fillStyle = ctx.strokeStyle = color("ink-2");
   ctx.lineWidth = devicePixelRatio;
   ctx.setLineDash([]); // uPlot leaves what its last line needed
-  ctx.fillText("prediction", begin + 4 * devicePixelRatio, bbox.top - 5 * devicePixelRatio);
+  ctx.fillText(WORD, begin + 4 * devicePixelRatio, bbox.top - 5 * devicePixelRatio);
+  const end = begin + 4 * devicePixelRatio + ctx.measureText(WORD).width;
   ctx.beginPath();
   ctx.moveTo(begin, bbox.top);
   ctx.lineTo(begin, bbox.top + bbox.height);
@@ -108,6 +111,7 @@ export function draw(u, signal, kind, color) {
   if (c.group === "mv") ctx.lineTo(bbox.left + bbox.width, before);
   ctx.stroke();
   ctx.restore();
+  return end;
 }
 
 // ------------------------------------------------------------------------------------------- before a change is set

@@ -2,6 +2,8 @@
 import { get, listen } from "./api.js";
 import * as card from "./card.js";
 import { Charts, plan } from "./charts.js";
+import { hear } from "./course_entry.js";
+import * as courses from "./courses.js";
 import { Data } from "./data.js";
 import * as faceplate from "./faceplate.js";
 import * as foresight from "./foresight.js";
@@ -30,7 +32,7 @@ let broken = false;
 let hidden = new Set(JSON.parse(localStorage.getItem("hidden") || "null") || []);
 
 const now = () => (state && state.time && !broken && state.alive ? Math.max(state.time, data.time.at(-1) || 0) : Date.now() / 1000);
-const view = new View(Number(localStorage.getItem("span")) || SPANS[0][1], now, foresight.ahead);
+const view = new View(Number(localStorage.getItem("span")) || SPANS[0][1], now, (span) => Math.max(foresight.ahead(span), courses.ahead(span)));
 const zoomed = (from, to) => look(() => view.look(from, to));
 const live = () => look(() => view.follow());
 const charts = new Charts($("charts"), { zoomed, back: live });
@@ -81,6 +83,7 @@ async function describeAll() {
   faceplate.describe(about);
   foresight.describe(about);
   ranges.describe(about);
+  courses.describe(about);
   card.describe(about);
   choice();
   build();
@@ -116,14 +119,18 @@ function show(found) {
   data.mode(found.time, found.mode);
   ranges.show(found);
   faceplate.show(found);
+  hear(found);
+  courses.show(found);
   card.show(found);
   fresh();
   foreseen();
 }
 
-// A prediction is asked for with each state, and drawn once it is here.
+// A prediction and the points of courses are asked for with each state, and drawn once they are here.
 async function foreseen() {
-  if (!about || !(await foresight.refresh())) return;
+  if (!about) return;
+  const news = await Promise.all([foresight.refresh(), courses.refresh()]);
+  if (!news.some(Boolean)) return;
   faceplate.foreseen();
   if (view.live) draw();
 }
