@@ -45,6 +45,8 @@ DOWN = tuple(2.0**-i for i in DOUBLINGS)
 
 def plain_exp(x: float) -> float:
     """The exponential function; LARGEST where it is no double."""
+    if x != x:  # NaN
+        return x
     if x >= MOST_EXP:
         return LARGEST
     if x <= LEAST_EXP:

@@ -22,6 +22,10 @@ def _each(function: Callable[[float], float]) -> Callable[[Floats], Floats]:
     return of_all
 
 
+def _chosen(of: Callable[..., Any]) -> Callable[..., Floats]:
+    return of
+
+
 def _truth(of: Callable[..., Any]) -> Callable[..., Floats]:
     return lambda *args: np.asarray(of(*args), dtype=np.float64)
 
@@ -30,7 +34,7 @@ def _truth(of: Callable[..., Any]) -> Callable[..., Floats]:
 _MEANING: dict[str, Callable[..., Floats]] = {
     "copy": lambda a: a,
     "neg": lambda a: -a,
-    "abs": lambda a: np.where(a < 0.0, -a, a),
+    "abs": _chosen(lambda a: np.where(a < 0.0, -a, a)),
     "sign": lambda a: np.asarray(a > 0.0, np.float64) - np.asarray(a < 0.0, np.float64),
     "sqrt": np.sqrt,
     "exp": _each(plain_exp),
@@ -41,8 +45,8 @@ _MEANING: dict[str, Callable[..., Floats]] = {
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
     "div": lambda a, b: a / b,
-    "min": lambda a, b: np.where(a < b, a, b),
-    "max": lambda a, b: np.where(a > b, a, b),
+    "min": _chosen(lambda a, b: np.where(a < b, a, b)),
+    "max": _chosen(lambda a, b: np.where(a > b, a, b)),
     "less": _truth(lambda a, b: a < b),
     "less_equal": _truth(lambda a, b: a <= b),
     "greater": _truth(lambda a, b: a > b),
@@ -50,8 +54,8 @@ _MEANING: dict[str, Callable[..., Floats]] = {
     "equal": _truth(lambda a, b: a == b),
     "and": _truth(lambda a, b: and_(a != 0.0, b != 0.0)),
     "or": _truth(lambda a, b: or_(a != 0.0, b != 0.0)),
-    "where": lambda c, a, b: np.where(c != 0.0, a, b),
-    "clip": lambda a, low, high: np.where(a < low, low, np.where(a > high, high, a)),
+    "where": _chosen(lambda c, a, b: np.where(c != 0.0, a, b)),
+    "clip": _chosen(lambda a, low, high: np.where(a < low, low, np.where(a > high, high, a))),
 }
 
 

@@ -210,6 +210,9 @@ class Lowering:
     def _where(self, node: onnx.NodeProto, args: list[View], given: dict[str, Any]) -> list[View]:
         return [self._each("where", args)]
 
+    def _reciprocal(self, node: onnx.NodeProto, args: list[View], given: dict[str, Any]) -> list[View]:
+        return [self._each("div", [self._hold(f"one over {node.output[0]}", np.ones(())), args[0]])]
+
     def _relu(self, node: onnx.NodeProto, args: list[View], given: dict[str, Any]) -> list[View]:
         return [self._each("max", [args[0], self._hold(f"zero of {node.output[0]}", np.zeros(()))])]
 
@@ -358,8 +361,9 @@ class Lowering:
 
     _others: ClassVar[dict[str, Callable[..., list[View]]]] = {
         "Cast": _cast, "Clip": _clip, "Concat": _concat, "Expand": _expand, "Gather": _gather, "Gemm": _gemm,
-        "Identity": _identity, "MatMul": _matmul, "Relu": _relu, "Reshape": _reshape, "Slice": _slice,
-        "Softmax": _softmax, "Split": _split, "Squeeze": _squeeze, "Tile": _tile, "Transpose": _transpose,
+        "Identity": _identity, "MatMul": _matmul, "Reciprocal": _reciprocal, "Relu": _relu, "Reshape": _reshape,
+        "Slice": _slice, "Softmax": _softmax, "Split": _split, "Squeeze": _squeeze, "Tile": _tile,
+        "Transpose": _transpose,
         "Unsqueeze": _unsqueeze, "Where": _where,
     }  # fmt: skip
 

@@ -111,8 +111,8 @@ def _any(text: str) -> str:
     """A number of the kit, which need not be finite."""
     value = float.fromhex(text)
     if np.isnan(value):
-        return "NAN"
-    return number(value) if np.isfinite(value) else "INFINITY" if value > 0 else "-INFINITY"
+        return "NO_NUMBER"
+    return number(value) if np.isfinite(value) else "INFINITE" if value > 0 else "-INFINITE"
 
 
 def _matrix(name: str, rows: Floats) -> str:
@@ -138,6 +138,9 @@ static const uint64_t SAME_BITS = UINT64_C({hash});
 {given}
 
 {wanted}
+
+#define NO_NUMBER 1.25e308
+#define INFINITE 1.5e308
 
 /* Before a scan: the mode that the operator sets, or -1; whether the last command did not arrive; periods without a
    scan; whether there is a sample. After it: mode, whether there is a fault, whether the MV is written, the MV. */
@@ -178,6 +181,16 @@ static int steps_differ(void)
     return hash != SAME_BITS;
 }}
 
+/* Not every compiler has NAN among its constants: these two stand for NaN and infinity in the table. */
+static double kit_number(double x)
+{{
+    static const volatile double none = 0.0;
+    if (x >= INFINITE || x <= -INFINITE) {{
+        return x / none;
+    }}
+    return x >= NO_NUMBER ? none / none : x;
+}}
+
 static int scans_differ(void)
 {{
     static {lower}_loop l;
@@ -187,7 +200,18 @@ static int scans_differ(void)
     l.max_gap = {max_gap};
     wrong += !{lower}_set_sp(&l, sp);
     for (int k = 0; k < SCANS; ++k) {{
+        {lower}_sample s = SCAN[k].sample;
         int as_wanted;
+        for (int i = 0; i < {upper}_N_PV; ++i) {{
+            s.pv[i] = kit_number(s.pv[i]);
+        }}
+        for (int i = 0; i < {upper}_N_DV; ++i) {{
+            s.dv[i] = kit_number(s.dv[i]);
+        }}
+        for (int i = 0; i < {upper}_N_MV; ++i) {{
+            s.mv_applied[i] = kit_number(s.mv_applied[i]);
+        }}
+        s.age_s = kit_number(s.age_s);
         if (SCAN[k].set_mode >= 0) {{
             {lower}_set_mode(&l, ({lower}_mode)SCAN[k].set_mode);
         }}
@@ -197,7 +221,7 @@ static int scans_differ(void)
         if (SCAN[k].missed > 0.0) {{
             {lower}_gap(&l, SCAN[k].missed);
         }}
-        as_wanted = {lower}_scan(&l, SCAN[k].is_read ? &SCAN[k].sample : NULL) == SCAN[k].writes;
+        as_wanted = {lower}_scan(&l, SCAN[k].is_read ? &s : NULL) == SCAN[k].writes;
         as_wanted = as_wanted && (int)l.mode == SCAN[k].mode && (l.why != {upper}_NONE) == SCAN[k].fault;
         for (int i = 0; i < {upper}_N_MV && SCAN[k].writes; ++i) {{
             const double range = {upper}_MV_HIGH[i] - {upper}_MV_LOW[i];
