@@ -12,7 +12,7 @@ from loopwright.pipeline.export.plain_code.c_header import printed_header
 from loopwright.pipeline.export.plain_code.c_text import PrintedStep, printed_step
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.self_test import kit_in_c, printed_self_test
-from loopwright.pipeline.export.plain_code.statements import Program
+from loopwright.pipeline.export.plain_code.statements import PlainProgram
 from loopwright.serving.controller import Controller
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.version import __version__
@@ -63,7 +63,7 @@ def c_folder(controller: Controller, name: str) -> dict[str, str]:
     }
 
 
-def _arguments(program: Program) -> list[str]:
+def _arguments(program: PlainProgram) -> list[str]:
     return [*program.inputs, *(n for n, count in program.outputs.items() if count)]
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from loopwright.pipeline.export.plain_code.memory import Memory, laid_out, without_copies
+from loopwright.pipeline.export.plain_code.memory import WorkMemory, laid_out, without_copies
 from loopwright.pipeline.export.plain_code.printed_functions import functions_in_c, number
-from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, Places, Program, Statement
+from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, Places, PlainProgram, PlainStatement
 
 WIDTH = 100  # characters of a line of numbers
 _INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
@@ -35,7 +35,7 @@ class PrintedStep:
     operations: int  # a step, always the same
 
 
-def printed_step(program: Program, name: str) -> PrintedStep:
+def printed_step(program: PlainProgram, name: str) -> PrintedStep:
     """The function ``NAME_step``, C99 and C++17: static tables, no heap, no library but sqrt.
 
     Each statement is a nest of loops as it stands in ``program``. Multiplication and addition are not contracted where
@@ -69,7 +69,7 @@ def printed_step(program: Program, name: str) -> PrintedStep:
 
 
 class _Printer:
-    def __init__(self, program: Program, memory: Memory) -> None:
+    def __init__(self, program: PlainProgram, memory: WorkMemory) -> None:
         self.program, self.memory = program, memory
         self.names: dict[str, str] = {}
         seen: dict[bytes, str] = {}
@@ -94,7 +94,7 @@ class _Printer:
             if len(values) > 1 and self.names[name] == name:
                 yield name, values
 
-    def statement(self, s: Statement) -> Iterator[str]:
+    def statement(self, s: PlainStatement) -> Iterator[str]:
         indent, outer = "    ", len(s.loops) - s.summed
         for d in range(outer):
             yield f"{indent}{_loop(d, s.loops[d])}"
@@ -108,7 +108,7 @@ class _Printer:
             indent = indent[:-4]
             yield f"{indent}}}"
 
-    def _together(self, s: Statement, target: str, indent: str, outer: int) -> Iterator[str]:
+    def _together(self, s: PlainStatement, target: str, indent: str, outer: int) -> Iterator[str]:
         extreme = _EXTREMES.get(s.op)
         args = [self.entry(p) for p in s.args]
         if not outer:

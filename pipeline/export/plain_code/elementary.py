@@ -15,10 +15,10 @@ from __future__ import annotations
 LARGEST = 1.7976931348623157e308  # of doubles
 TINIEST = 2.2250738585072014e-308  # normal double
 SHIFT = 6755399441055744.0  # 1.5 * 2^52: a number below 2^51 plus it, less it, is rounded to the nearest integer
-LOG2_E = 1.4426950408889634
+LOG2_E = 1.4426950408889634  # 1/ln 2
 LN2_HIGH, LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10  # the first of 32 bits: times an integer it is exact
 MOST_EXP, LEAST_EXP = 709.782712893384, -745.1332191019412  # arguments: beyond them exp is no double
-SQRT_2 = 1.4142135623730951
+SQRT_2 = 1.4142135623730951  # where log halves its argument
 LOW_TANH, HIGH_TANH = 0.75, 20.0  # below the first a rational function, from the second on 1
 
 # exp r = 1 + r + r^2 q(r), |r| <= ln(2)/2; relative error 4e-19
@@ -34,10 +34,12 @@ LOG = (
 )  # fmt: skip
 # tanh x = x + x^3 n(x^2)/d(x^2), |x| <= LOW_TANH; 9e-18
 TANH_ABOVE = (-0.3333333333333333, -0.02141717864218934, -0.0002436483349790261, -1.7402064256825756e-08)
-TANH_BELOW = (1.0, 0.464251535926568, 0.02452679747080311, 0.0002547024148604486)
+TANH_BELOW = (1.0, 0.464251535926568, 0.02452679747080311, 0.0002547024148604486)  # d
+# powers of 2 from -544 by 32, and from 0 by 1
 COARSE = tuple(2.0 ** (32 * i - 544) for i in range(35))
 FINE = tuple(2.0**i for i in range(32))
 OFFSET = 1088.0  # twice 544: powers of 2 count from it, so that no integer is negative
+# powers of 2 by which log goes nearer to 1
 DOUBLINGS = (512.0, 256.0, 128.0, 64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)
 UP = tuple(2.0**i for i in DOUBLINGS)
 DOWN = tuple(2.0**-i for i in DOUBLINGS)
@@ -98,7 +100,9 @@ def plain_log(x: float) -> float:
 
 
 def plain_tanh(x: float) -> float:
-    """Tanh x."""
+    """The hyperbolic tangent."""
+    if x != x:  # NaN
+        return x
     size: float = x if x >= 0.0 else -x
     if size < LOW_TANH:
         z: float = x * x

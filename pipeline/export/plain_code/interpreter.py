@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from loopwright.pipeline.export.plain_code.elementary import plain_exp, plain_log, plain_tanh
-from loopwright.pipeline.export.plain_code.statements import Floats, Place, Places, Program, Statement
+from loopwright.pipeline.export.plain_code.statements import Floats, Place, Places, PlainProgram, PlainStatement
 
 
 def _each(function: Callable[[float], float]) -> Callable[[Floats], Floats]:
@@ -59,7 +59,7 @@ _MEANING: dict[str, Callable[..., Floats]] = {
 }
 
 
-def run_statement(statement: Statement, arrays: Mapping[str, Floats], tables: Mapping[str, Places]) -> None:
+def run_statement(statement: PlainStatement, arrays: Mapping[str, Floats], tables: Mapping[str, Places]) -> None:
     """Do one statement on ``arrays`` (..., n), in place: in each of many steps side by side, if there are such."""
     s = statement
     outer, inner = s.loops[: len(s.loops) - s.summed], s.loops[len(s.loops) - s.summed :]
@@ -90,7 +90,7 @@ def run_statement(statement: Statement, arrays: Mapping[str, Floats], tables: Ma
     arrays[s.target.buffer][..., entries(s.target, zero)] = result
 
 
-def run(program: Program, **inputs: Floats) -> dict[str, Floats]:
+def run(program: PlainProgram, **inputs: Floats) -> dict[str, Floats]:
     """The outputs (..., n) by name, from each input (..., n): of one step, or of many side by side."""
     steps = np.broadcast_shapes(*(np.shape(inputs[name])[:-1] for name in program.inputs))
     arrays = {name: np.zeros((*steps, n)) for name, n in {**program.outputs, **program.arrays}.items()}

@@ -13,7 +13,7 @@ from onnx import numpy_helper
 
 from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export.plain_code.interpreter import run_statement
-from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, Places, Program, Statement
+from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, Places, PlainProgram, PlainStatement
 from loopwright.pipeline.export.plain_code.views import View
 
 ONE_OF_ONE = {
@@ -38,7 +38,7 @@ class Lowering:
         self.constants: dict[str, Floats] = {}
         self.tables: dict[str, Places] = {}
         self.arrays: dict[str, int] = {}
-        self.statements: list[Statement] = []
+        self.statements: list[PlainStatement] = []
         self.views: dict[str, View] = {}
         self.integers: dict[str, Places] = {}  # shapes, axes and indices
         for given in graph.initializer:
@@ -55,12 +55,12 @@ class Lowering:
             assert prod(view.shape) == count
             self._emit("copy", target, [view])
 
-    def program(self) -> Program:
+    def program(self) -> PlainProgram:
         """All of it."""
         outputs = {OUTPUT + name: n for name, n in self.outputs.items()}
         used = {p.buffer for s in self.statements for p in s.args}
         constants = {name: values for name, values in self.constants.items() if name in used}
-        return Program(self.inputs, outputs, constants, self.tables, self.arrays, tuple(self.statements))
+        return PlainProgram(self.inputs, outputs, constants, self.tables, self.arrays, tuple(self.statements))
 
     # ------------------------------------------------------------------------------------------------ arrays and views
     def _hold(self, name: str, values: np.ndarray[Any, Any]) -> View:
@@ -82,9 +82,9 @@ class Lowering:
         places = [a.broadcast(target.shape).place() for a in args]
         if table:
             places[0] = replace(places[0], table=table)
-        self._add(Statement(op, target.place(), tuple(places), target.shape))
+        self._add(PlainStatement(op, target.place(), tuple(places), target.shape))
 
-    def _add(self, statement: Statement) -> None:
+    def _add(self, statement: PlainStatement) -> None:
         """A statement; one of constants alone is done at once and is a constant itself."""
         buffer = statement.target.buffer
         if buffer in self.arrays and all(p.buffer in self.constants for p in statement.args):
@@ -158,14 +158,14 @@ class Lowering:
         return found.without(axes)
 
     def _together(self, op: str, view: View, axes: Sequence[int]) -> View:
-        """What lies along ``axes`` put together; they stay, with one entry each."""
+        """Entries along ``axes`` put together; the axes stay, with one entry each."""
         held = [d for d in range(len(view.shape)) if d not in axes]
         order = [*held, *axes]
         target = self._new([1 if d in axes else n for d, n in enumerate(view.shape)])
         strides = tuple(0 if d in axes else target.strides[d] for d in order)
         read = Place(view.buffer, view.offset, tuple(view.strides[d] for d in order))
         loops = tuple(view.shape[d] for d in order)
-        self._add(Statement(op, Place(target.buffer, target.offset, strides), (read,), loops, len(axes)))
+        self._add(PlainStatement(op, Place(target.buffer, target.offset, strides), (read,), loops, len(axes)))
         return target
 
     def _product(self, a: View, b: View, added: View | None = None) -> View:
@@ -186,7 +186,7 @@ class Lowering:
             c = added.broadcast(target.shape)
             args.append(Place(c.buffer, c.offset, (*c.strides, 0)))
         at = Place(target.buffer, target.offset, (*target.strides, 0))
-        self._add(Statement("dot", at, tuple(args), (*target.shape, inner), 1))
+        self._add(PlainStatement("dot", at, tuple(args), (*target.shape, inner), 1))
         return target.without([d for d, one in zip((-2, -1), single, strict=True) if one])
 
     def _matmul(self, node: onnx.NodeProto, args: list[View], given: dict[str, Any]) -> list[View]:
@@ -282,7 +282,7 @@ class Lowering:
 
     def _copy(self, target: View, view: View, *, keep: bool) -> None:
         """Entries of a part of an array; with ``keep`` done at each step, constants too."""
-        statement = Statement("copy", target.place(), (view.broadcast(target.shape).place(),), target.shape)
+        statement = PlainStatement("copy", target.place(), (view.broadcast(target.shape).place(),), target.shape)
         if keep:
             self.statements.append(statement.simplified())
         else:
@@ -368,7 +368,7 @@ class Lowering:
     }  # fmt: skip
 
 
-def lowered(model: onnx.ModelProto) -> Program:
+def lowered(model: onnx.ModelProto) -> PlainProgram:
     """The statements of a controller's graph; ExportError for an operator that laws do not use."""
     return Lowering(model).program()
 

@@ -6,18 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from loopwright.pipeline.export.plain_code.statements import Place, Program
+from loopwright.pipeline.export.plain_code.statements import Place, PlainProgram
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class WorkMemory:
     """First entry of each array, and the entries of all."""
 
     starts: Mapping[str, int]
     size: int
 
 
-def without_copies(program: Program) -> Program:
+def without_copies(program: PlainProgram) -> PlainProgram:
     """The same with results made where they are copied to: parts of what is put together, and the outputs."""
     statements = list(program.statements)
     moved: dict[str, tuple[str, int]] = {}  # an array to a place in another
@@ -46,11 +46,11 @@ def without_copies(program: Program) -> Program:
     return replace(program, arrays=arrays, statements=tuple(kept))
 
 
-def _by_table(program: Program, buffer: str) -> bool:
+def _by_table(program: PlainProgram, buffer: str) -> bool:
     return any(p.table and p.buffer == buffer for s in program.statements for p in s.args)
 
 
-def lives(program: Program) -> dict[str, tuple[int, int]]:
+def lives(program: PlainProgram) -> dict[str, tuple[int, int]]:
     """The statements from the first that writes an array to the last that reads it."""
     found: dict[str, tuple[int, int]] = {}
     for k, s in enumerate(program.statements):
@@ -60,7 +60,7 @@ def lives(program: Program) -> dict[str, tuple[int, int]]:
     return found
 
 
-def laid_out(program: Program) -> Memory:
+def laid_out(program: PlainProgram) -> WorkMemory:
     """A place for each array, the largest first, as low as those allow that live at the same time."""
     alive = lives(program)
     starts: dict[str, int] = {}
@@ -76,10 +76,10 @@ def laid_out(program: Program) -> Memory:
             start = max(start, end)
         starts[name] = start
     size = max((start + program.arrays[name] for name, start in starts.items()), default=0)
-    return Memory(starts, size)
+    return WorkMemory(starts, size)
 
 
-def overlaps(program: Program, memory: Memory) -> list[tuple[str, str]]:
+def overlaps(program: PlainProgram, memory: WorkMemory) -> list[tuple[str, str]]:
     """Arrays that share an entry while both live: none, or the memory is wrong."""
     alive = lives(program)
     found = []

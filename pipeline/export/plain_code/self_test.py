@@ -11,13 +11,13 @@ import numpy as np
 from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export.plain_code.interpreter import run
 from loopwright.pipeline.export.plain_code.printed_functions import number
-from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Program
+from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, PlainProgram
 from loopwright.serving.conformance.kit import CHAIN_TOLERANCE, KIT_TOLERANCE, read_all, vectors_of
 from loopwright.serving.controller import Controller
 from loopwright.serving.modes import Mode
 
 FNV_BEGIN, FNV_PRIME = 14695981039346656037, 1099511628211  # of the 64-bit hash FNV-1a
-WORD = (1 << 64) - 1
+WORD = (1 << 64) - 1  # the bits of the hash
 MODES = (Mode.MANUAL, Mode.AUTO, Mode.HOLD)
 
 
@@ -35,7 +35,7 @@ class KitInC:
     scans: Sequence[Mapping[str, Any]]
 
 
-def kit_in_c(controller: Controller, program: Program) -> KitInC:
+def kit_in_c(controller: Controller, program: PlainProgram) -> KitInC:
     """The kit, its steps run by the statements.
 
     ExportError where they part from the controller by more than ``KIT_TOLERANCE`` of an entry's scale.
@@ -63,7 +63,7 @@ def hashed(rows: Floats) -> int:
     return found
 
 
-def printed_self_test(head: str, name: str, program: Program, kit: KitInC) -> str:
+def printed_self_test(head: str, name: str, program: PlainProgram, kit: KitInC) -> str:
     """``NAME_selftest.c``: exits with 0 where all bits of the steps are the same and the loop does as the kit says."""
     inputs = list(program.inputs.items())
     outputs = [(n.removeprefix(OUTPUT), count) for n, count in program.outputs.items() if count]

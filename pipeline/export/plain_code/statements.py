@@ -55,7 +55,7 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Statement:
+class PlainStatement:
     """One nest of loops: ``loops`` counts, outer ones first, of which the last ``summed`` are put together."""
 
     op: str
@@ -75,7 +75,7 @@ class Statement:
         """How often its operation is done."""
         return prod(self.loops)
 
-    def simplified(self) -> Statement:
+    def simplified(self) -> PlainStatement:
         """The same without loops of one round, and with loops in one that run through entries in the same order."""
         kept = [d for d, n in enumerate(self.loops) if n != 1]
         outer = len([d for d in kept if d < len(self.loops) - self.summed])
@@ -99,7 +99,7 @@ class Statement:
 
 
 @dataclass(frozen=True, slots=True)
-class Program:
+class PlainProgram:
     """All of a step: from ``inputs`` to ``outputs`` by statements over constants and arrays of its own."""
 
     inputs: Mapping[str, int]  # entries
@@ -107,7 +107,7 @@ class Program:
     constants: Mapping[str, Floats]
     tables: Mapping[str, Places]
     arrays: Mapping[str, int]  # entries of what it writes beside the outputs
-    statements: tuple[Statement, ...]
+    statements: tuple[PlainStatement, ...]
 
     @property
     def operations(self) -> int:

@@ -20,7 +20,7 @@ from loopwright.pipeline.export.plain_code.interpreter import run
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.memory import laid_out, overlaps, without_copies
 from loopwright.pipeline.export.plain_code.self_test import kit_in_c
-from loopwright.pipeline.export.plain_code.statements import Place, Statement
+from loopwright.pipeline.export.plain_code.statements import Place, PlainStatement
 from loopwright.serving import Controller
 
 MOST_STACK = 32 * 1024  # bytes of a shipped file's step
@@ -81,10 +81,10 @@ def test_an_operator_that_laws_do_not_use_is_refused() -> None:
 
 def test_loops_that_run_through_the_same_entries_become_one() -> None:
     at = Place("a", 0, (12, 4, 1))
-    found = Statement("copy", at, (replace(at, buffer="b"),), (2, 3, 4)).simplified()
+    found = PlainStatement("copy", at, (replace(at, buffer="b"),), (2, 3, 4)).simplified()
     assert found.loops == (24,)
-    turned = Statement("copy", at, (Place("b", 0, (1, 2, 6)),), (2, 3, 4)).simplified()
+    turned = PlainStatement("copy", at, (Place("b", 0, (1, 2, 6)),), (2, 3, 4)).simplified()
     assert turned.loops == (2, 3, 4)
-    summed = Statement("dot", Place("y", 0, (1, 0)), (Place("a", 0, (5, 1)), Place("x", 0, (0, 1))), (1, 5), 1)
+    summed = PlainStatement("dot", Place("y", 0, (1, 0)), (Place("a", 0, (5, 1)), Place("x", 0, (0, 1))), (1, 5), 1)
     assert summed.simplified().loops == (5,)
     assert summed.simplified().summed == 1
