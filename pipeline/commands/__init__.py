@@ -31,6 +31,7 @@ COMMANDS = {
     "sign": "sign a controller file and its manifest, so that others can tell who made it",
     "verify": "say which of some keys signed a controller file, or fail",
     "conformance": "write test vectors of a controller file for a host in any language, or check its answers",
+    "c": "write a controller file as plain C without heap and library, for microcontrollers and programs of your own",
     "fmu": "write a controller file as a Functional Mock-up Unit, for Simulink, Modelica tools and test benches",
     "laws": "list the control laws, or the parameters of one",
     "models": "list the kinds of model, or the parameters of one",
