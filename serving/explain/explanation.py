@@ -130,7 +130,7 @@ class WhatIf:
 # ------------------------------------------------------------------------------------------------ a move in plain words
 LEAST_SHARE = 0.05  # of a side's sum: a smaller part is not named
 MOST_NAMED = 3  # parts of a side: more than that nobody reads
-STANDS = 1e-4  # of an MV's range: a smaller move is none
+STANDS = 5e-4  # of an MV's range: a smaller move is none
 
 
 def sentence_of(move: float, span: float, parts: Sequence[MovePart], news: Mapping[str, float]) -> str:
@@ -177,5 +177,5 @@ def words(part: MovePart, news: Mapping[str, float]) -> str:
         "mv_high": f"{name} at its high limit",
         "max_move": f"{name} moves no faster",
         "not_in_use": f"{name} is not in use",
-        "plan": "the last plan, not yet worked off",
+        "plan": "what was planned before",
     }[part.cause]

@@ -240,6 +240,17 @@ def test_what_the_law_predicts_is_drawn_right_of_now_and_said(page: Page) -> Non
     expect(page.locator('[data-chart="y0"]')).to_have_attribute("data-ahead", "0")
 
 
+def test_a_law_that_moves_nothing_predicts_nothing(page: Page, steered: Steered) -> None:
+    loop, _ = steered
+    expect(fact(page, "y0", "expected")).to_be_visible()
+    loop.does("mode", "MANUAL")
+    expect(fact(page, "y0", "expected")).to_be_hidden()
+    expect(fact(page, "u0", "why")).to_be_hidden()
+    expect(page.locator('[data-chart="y0"]')).to_have_attribute("data-ahead", "0")
+    loop.does("mode", "AUTO")
+    expect(fact(page, "y0", "expected")).to_be_visible()
+
+
 def test_a_change_is_looked_at_before_it_is_set(page: Page, steered: Steered) -> None:
     loop, _ = steered
     events = loop.events()
@@ -247,9 +258,12 @@ def test_a_change_is_looked_at_before_it_is_set(page: Page, steered: Steered) ->
     page.fill('[data-field="y0"]', "1.5")
     rows = page.locator("#dialog-foreseen tbody tr")
     expect(rows).to_have_count(4)
-    now, changed = (float(str(text).split(" ")[0]) for text in rows.nth(2).locator("td").all_text_contents())
+    *ends, between = rows.nth(2).locator("td").all_text_contents()
+    now, changed = (float(text.split(" ")[0]) for text in ends)
+    low, high = map(float, between.split(" … "))
     assert rows.nth(2).locator("th").text_content() == "y0"
     assert abs(changed - 1.5) < abs(now - 1.5)
+    assert low <= changed <= high
     page.click("#cancel")
     page.click('[data-change="y0"]')
     page.fill('[data-field="y0.high"]', "-9")

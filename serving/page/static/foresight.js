@@ -6,7 +6,7 @@ import { foresee, get } from "./api.js";
 const AGAIN_MS = 10_000; // after a refusal: a law that is not stepped yet will be, a file that is missing may come
 const SHARE = 0.4; // of the time that is shown, which the future may have beside it
 const DASH = [5, 4];
-const STANDS = 1e-4; // of an MV's range: a smaller move is none, as the sentence has it
+const STANDS = 5e-4; // of an MV's range: a smaller move is none, as the sentence has it
 let found = null; // { time, courses, moves }
 let missing = ""; // why there is none
 let speed = 1;
@@ -14,6 +14,7 @@ let law = ""; // whose it is
 let asking = false;
 let next_ms = 0; // before which it is not asked for
 let steers = false;
+let auto = false; // in any other mode the law moves nothing: what it would do is no prediction of the plant
 
 export function describe(about) {
   steers = (about.operate || []).length > 0;
@@ -21,6 +22,10 @@ export function describe(about) {
   if (law === about.card.sha256) return;
   law = about.card.sha256;
   [found, missing, next_ms] = [null, "", 0];
+}
+
+export function follow(mode) {
+  auto = mode === "AUTO";
 }
 
 // Asks for it anew, at most once at a time; true where there is something new.
@@ -41,12 +46,12 @@ export async function refresh() {
 }
 
 export const why = () => missing;
-const course = (signal) => found?.courses.find((c) => c.signal === signal.name);
-export const move = (signal) => found?.moves.find((m) => m.mv === signal.name);
+const course = (signal) => (auto ? found?.courses.find((c) => c.signal === signal.name) : undefined);
+export const move = (signal) => (auto ? found?.moves.find((m) => m.mv === signal.name) : undefined);
 
 // The seconds after now that are drawn beside `span` seconds of the past.
 export function ahead(span) {
-  if (!found) return 0;
+  if (!found || !auto) return 0;
   const last = Math.max(...found.courses.map((c) => c.times_s.at(-1)));
   return Math.min(last / speed, SHARE * span);
 }
@@ -120,15 +125,16 @@ export const foresees = () => found !== null;
 // A table of what the signals would do after a change by name, beside what they do without it.
 export async function whatIf(changes, signals) {
   const { before, after } = await foresee(changes);
-  const end = (of, signal) => of.courses.find((c) => c.signal === signal.name)?.values.at(-1);
-  const rows = signals.filter((s) => end(after, s) !== undefined);
+  const values = (of, signal) => of.courses.find((c) => c.signal === signal.name)?.values;
+  const rows = signals.filter((s) => values(after, s) !== undefined);
   const last = Math.max(...after.courses.map((c) => c.times_s.at(-1)));
-  const cell = (s, of) => element("td", {}, `${number(end(of, s), s)} ${unit(s)}`.trim());
+  const cell = (s, of) => element("td", {}, `${number(values(of, s).at(-1), s)} ${unit(s)}`.trim());
+  const between = (s) => [Math.min, Math.max].map((of) => number(of(...values(after, s)), s)).join(" … ");
   return element(
     "table",
     {},
-    element("caption", {}, `In ${duration(last)}, by the law's own model`),
-    element("thead", {}, element("tr", {}, ...["", "as it is", "changed"].map((words) => element("th", {}, words)))),
-    element("tbody", {}, ...rows.map((s) => element("tr", {}, element("th", { scope: "row" }, s.name), cell(s, before), cell(s, after)))),
+    element("caption", {}, `${auto ? "In" : "In AUTO, after"} ${duration(last)}, by the law's own model`),
+    element("thead", {}, element("tr", {}, ...["", "as it is", "changed", "on the way"].map((words) => element("th", {}, words)))),
+    element("tbody", {}, ...rows.map((s) => element("tr", {}, element("th", { scope: "row" }, s.name), cell(s, before), cell(s, after), element("td", {}, between(s))))),
   );
 }

@@ -118,6 +118,7 @@ function show(found) {
   state = found;
   data.mode(found.time, found.mode);
   ranges.show(found);
+  foresight.follow(found.mode);
   faceplate.show(found);
   hear(found);
   courses.show(found);

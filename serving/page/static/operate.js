@@ -197,7 +197,7 @@ export function askChange(group, signal) {
     });
   ask({
     title: `Change ${signal ? signal.name : law}`,
-    words: "It counts from the next scan on. The law asks for no more than the new values do.",
+    words: "It counts from the next scan on.",
     fields,
     foresee,
     request: (values) => ({ do: "operate", value: values }),
