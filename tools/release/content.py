@@ -18,6 +18,7 @@ TOP, PACKAGES = "loopwright", ("pipeline", "serving")
 OPENED = {
     "loopwright/serving/page/static": {".js", ".css", ".html", ".svg"},
     "loopwright/pipeline/report/templates": {".j2"},
+    "loopwright/pipeline/export/plain_code": {".c", ".h"},
     "loopwright/pipeline/hosts/c": {".c"},
     "loopwright/pipeline/hosts/c/onnxruntime": {".h"},
     "loopwright/pipeline/hosts/javascript": {".mjs"},
