@@ -148,11 +148,14 @@ class Planner(nn.Module):
     ) -> None:
         super().__init__()
         self.valleys = valleys  # more MVs than set points: a step along the cost's flat directions beside the sweeps
-        # Of such a law later moves come first within operators' bounds: the first move, which acts, is then the best
-        # beside all others as they end. In the other order the first MV took what a range asked for, sample after
-        # sample, and the last one stayed: three valves went to their ends together, and a set point within a range
-        # that was narrowed was not reached.
-        self.order = range(moves.count - 1, -1, -1) if valleys else range(moves.count)
+        # Within operators' bounds such a law sweeps later moves first, each move's MVs in their order: the first move,
+        # which acts, is then the best beside all others as they end. With the first move first its first MV took what
+        # a range asked for, sample after sample, and the last one stayed: three valves went to their ends together, and
+        # a set point within a range that was narrowed was not reached. With all in reverse noise at the end of a range
+        # did the same.
+        starts, each = len(moves.starts), moves.count // len(moves.starts)
+        turned = [g * each + j for g in reversed(range(starts)) for j in range(each)]
+        self.order = turned if valleys else list(range(moves.count))
         self.limits = limits
         self.horizon, self.passes, self.sweeps, self.m = horizon, passes, sweeps, moves.count
         self.n_cv = len(cost.weights)
@@ -336,7 +339,7 @@ class Planner(nn.Module):
         c = self.eye * (pull / diagonal)
         into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
         add = torch.split(c, 1, dim=-2)
-        order = range(m) if bounds is None else self.order
+        order = list(range(m)) if bounds is None else self.order
         for _ in range(self.sweeps):
             if bounds is None and self.rate is None:
                 for p in order:
