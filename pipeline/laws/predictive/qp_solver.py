@@ -148,11 +148,12 @@ class Planner(nn.Module):
     ) -> None:
         super().__init__()
         self.valleys = valleys  # more MVs than set points: a step along the cost's flat directions beside the sweeps
-        # Within operators' bounds such a law sweeps later moves first, each move's MVs in their order: the first move,
-        # which acts, is then the best beside all others as they end. With the first move first its first MV took what
-        # a range asked for, sample after sample, and the last one stayed: three valves went to their ends together, and
-        # a set point within a range that was narrowed was not reached. With all in reverse noise at the end of a range
-        # did the same.
+        # Within operators' bounds and without rates such a law sweeps later moves first, each move's MVs in their
+        # order: the first move, which acts, is then the best beside all others as they end. With the first move first
+        # its first MV took what a range asked for, sample after sample, and the last one stayed: three valves went to
+        # their ends together, and a set point within a range that was narrowed was not reached. With all in reverse
+        # noise at the end of a range did the same. With rates, which hold such a drift back, the first move stays
+        # first: of two ranges at odds on a furnace the later ones first kept the wrong one.
         starts, each = len(moves.starts), moves.count // len(moves.starts)
         turned = [g * each + j for g in reversed(range(starts)) for j in range(each)]
         self.order = turned if valleys else list(range(moves.count))
@@ -339,14 +340,13 @@ class Planner(nn.Module):
         c = self.eye * (pull / diagonal)
         into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
         add = torch.split(c, 1, dim=-2)
-        order = list(range(m)) if bounds is None else self.order
         for _ in range(self.sweeps):
             if bounds is None and self.rate is None:
-                for p in order:
+                for p in range(m):
                     plan = hardtanh(product(plan, into[p], add[p]))
                 continue
             low, high = self.ends(product(plan, self.before, at), bounds)
-            for p in order:
+            for p in range(m):
                 plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
         return plan
 
