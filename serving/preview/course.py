@@ -215,7 +215,7 @@ class Courses:
         return self._differences_of(manifest.ahead).within(change, values)
 
     def _differences_of(self, of: AheadInput) -> Differences:
-        """Those of a controller's input, which keep it, so that no other one has its place in memory."""
+        """The differences of a controller's input; they keep it, so that no other one has its place in memory."""
         if id(of) not in self._differences:
             self._differences[id(of)] = Differences(of)
         return self._differences[id(of)]

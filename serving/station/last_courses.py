@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import sqlite3
 from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from math import isfinite
@@ -14,9 +12,10 @@ from typing import Any, Self
 
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import is_number
-from loopwright.serving.journal import Journal, JournalReader
+from loopwright.serving.journal import Journal
 from loopwright.serving.loop import ControlLoop
 from loopwright.serving.preview.course import Course
+from loopwright.serving.station.last_run import kept_at_end
 from loopwright.serving.words import first_line
 
 COURSES = "courses"  # what they are kept under
@@ -66,14 +65,10 @@ class LastCourses:
     @classmethod
     def before(cls, journal: Path) -> Self:
         """The courses that the last loop of a journal ended with; none where it does not tell."""
-        kept: Any = None
-        with suppress(LoopError, sqlite3.Error, ValueError, RecursionError), closing(JournalReader(journal)) as reader:
-            kept = json.loads(reader.learnt(COURSES) or "{}")
-        if not isinstance(kept, dict) or not isinstance(kept.get("sha256"), str):
-            return cls()
+        kept = kept_at_end(journal, COURSES)
         rows = kept.get("courses")
         found = {str(name): _dated(row) for name, row in rows.items()} if isinstance(rows, dict) else {}
-        return cls(kept["sha256"], {name: of for name, of in found.items() if of is not None})
+        return cls(kept.get("sha256", ""), {name: of for name, of in found.items() if of is not None})
 
     def keep(self, journal: Journal) -> None:
         """Write it down."""

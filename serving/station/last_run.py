@@ -19,6 +19,17 @@ from loopwright.serving.words import first_line
 STEERED = "steered"  # what it is kept under
 
 
+def kept_at_end(journal: Path, name: str) -> dict[str, Any]:
+    """The entries that the last loop of a journal kept under ``name``, its controller's ``sha256`` among them.
+
+    Empty where the journal does not tell.
+    """
+    kept: Any = None
+    with suppress(LoopError, sqlite3.Error, ValueError, RecursionError), closing(JournalReader(journal)) as reader:
+        kept = json.loads(reader.learnt(name) or "{}")
+    return kept if isinstance(kept, dict) and isinstance(kept.get("sha256"), str) else {}
+
+
 @dataclass(frozen=True, slots=True)
 class Steered:
     """The set points of a loop, and the values of ``operate`` that somebody had set, by name; of which controller."""
@@ -38,12 +49,8 @@ class Steered:
     @classmethod
     def before(cls, journal: Path) -> Self:
         """The values that the last loop of a journal ended with; empty where it does not tell."""
-        kept: Any = None
-        with suppress(LoopError, sqlite3.Error, ValueError, RecursionError), closing(JournalReader(journal)) as reader:
-            kept = json.loads(reader.learnt(STEERED) or "{}")
-        if not isinstance(kept, dict) or not isinstance(kept.get("sha256"), str):
-            return cls()
-        return cls(kept["sha256"], _numbers(kept.get("sp")), _numbers(kept.get("operate")))
+        found = kept_at_end(journal, STEERED)
+        return cls(found["sha256"], _numbers(found.get("sp")), _numbers(found.get("operate"))) if found else cls()
 
     def keep(self, journal: Journal) -> None:
         """Write it down."""

@@ -12,7 +12,7 @@ from loopwright.pipeline.export.plain_code.c_header import printed_header
 from loopwright.pipeline.export.plain_code.c_text import PrintedStep, printed_step
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.self_test import kit_in_c, printed_self_test
-from loopwright.pipeline.export.plain_code.statements import PlainProgram
+from loopwright.pipeline.export.plain_code.statements import OUTPUT
 from loopwright.serving.controller import Controller
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.version import __version__
@@ -51,7 +51,8 @@ def c_folder(controller: Controller, name: str) -> dict[str, str]:
         f"Law {m.law} of {m.case}, made of {controller.path.name} by loopwright {__version__}.\n"
         f"   sha256 of that file: {controller.sha256}"
     ).replace("*/", "* /")
-    call = ", ".join(IN_GUARD[n.removeprefix("out_")] for n in _arguments(program))
+    arguments = [*program.inputs, *(n for n, count in program.outputs.items() if count)]
+    call = ", ".join(IN_GUARD[n.removeprefix(OUTPUT)] for n in arguments)
     guards = {f"{name}_guard.{end}": _of_template(f"guard.{end}", name, head, call) for end in ("h", "c")}
     return {
         f"{name}.h": printed_header(head, m, controller.sha256, name, step),
@@ -61,10 +62,6 @@ def c_folder(controller: Controller, name: str) -> dict[str, str]:
         "Makefile": _MAKEFILE.replace("LAW", name),
         "CMakeLists.txt": _CMAKE.replace("LAW", name),
     }
-
-
-def _arguments(program: PlainProgram) -> list[str]:
-    return [*program.inputs, *(n for n, count in program.outputs.items() if count)]
 
 
 def _of_template(file: str, name: str, head: str, call: str) -> str:

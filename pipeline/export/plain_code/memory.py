@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import combinations
 
 from loopwright.pipeline.export.plain_code.statements import Place, PlainProgram
 
@@ -20,13 +20,13 @@ class WorkMemory:
 def without_copies(program: PlainProgram) -> PlainProgram:
     """The same with results made where they are copied to: parts of what is put together, and the outputs."""
     statements = list(program.statements)
-    moved: dict[str, tuple[str, int]] = {}  # an array to a place in another
+    moved: dict[str, tuple[str, int]] = {}  # an array, none that a table reads, to a place in another
 
     def found(place: Place) -> Place:
         buffer, offset = place.buffer, place.offset
         while buffer in moved:
             buffer, by = moved[buffer]
-            offset += by if not place.table else 0
+            offset += by
         return replace(place, buffer=buffer, offset=offset)
 
     for s in statements:
@@ -83,7 +83,7 @@ def overlaps(program: PlainProgram, memory: WorkMemory) -> list[tuple[str, str]]
     """Arrays that share an entry while both live: none, or the memory is wrong."""
     alive = lives(program)
     found = []
-    for a, b in pairwise(sorted(memory.starts, key=lambda n: memory.starts[n])):
+    for a, b in combinations(sorted(memory.starts, key=lambda n: memory.starts[n]), 2):
         together = alive[a][0] <= alive[b][1] and alive[b][0] <= alive[a][1]
         if together and memory.starts[b] < memory.starts[a] + program.arrays[a]:
             found.append((a, b))
