@@ -237,7 +237,7 @@ def test_a_request_is_carried_out_written_down_and_shown(
 ) -> None:
     made = make_station(operated, operate={"speed": 2.0})
     _, events = ran(made, s2=asked(made, {"valve.high": 60, "T.use": 0}))
-    assert "change anna: operate T.use 1 -> 0, valve.high 100 -> 60 % (valve sticks)" in events
+    assert "change anna: T taken out; valve: high limit 100 -> 60 % (valve sticks)" in events
     names = [row["name"] for row in about(made)["operate"]]
     shown = dict(zip(names, state(made)["operate"], strict=True))
     assert (shown["valve.high"], shown["T.use"], shown["speed"]) == (60.0, 0.0, 2.0)
@@ -270,7 +270,7 @@ def test_a_request_that_another_one_has_made_impossible_is_refused_in_the_journa
         asked(made, {"valve.low": 50.0})(plant)
 
     _, events = ran(made, s2=both)
-    assert any("refused: operate valve.low 0 -> 50 %" in line for line in events)
+    assert any("refused: valve: low limit 0 -> 50 %" in line for line in events)
 
 
 def test_the_plants_own_operator_steers_by_nodes(operated: Controller, make_station: Callable[..., Station]) -> None:
@@ -285,10 +285,10 @@ def test_the_plants_own_operator_steers_by_nodes(operated: Controller, make_stat
     made.endpoint.asked = {"valve.low": 10.0, "valve.high": 60.0, "T.use": 1.0}  # type: ignore[attr-defined]
     _, events = ran(made, s3=both_ends, s6=one_wrong)
     said = [line for line in events if line.startswith("change plant")]
-    assert said[0] == "change plant: operate valve.low 10 %, valve.high 60 %, T.use 1 ()"  # as it stood at first
-    assert said[1] == "change plant: operate valve.low 70 %, valve.high 90 % ()"
-    assert said[2].startswith("change plant: refused: operate valve.low 95 %")
-    assert said[3] == "change plant: operate T.use 0 ()"
+    assert said[0] == "change plant: valve: low limit 0 -> 10 %, high limit 100 -> 60 % ()"  # as it stood at first
+    assert said[1] == "change plant: valve: low limit 10 -> 70 %, high limit 60 -> 90 % ()"
+    assert said[2].startswith("change plant: refused: valve: low limit 70 -> 95 %")
+    assert said[3] == "change plant: T taken out ()"
     assert len(said) == 4
     assert made.loop is not None
     assert made.loop.operate[[0, 5, 6]].tolist() == [0.0, 70.0, 90.0]
