@@ -89,6 +89,9 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     for name, words in (("sp", "set points"), ("mv", "MVs by hand, in MANUAL or out of use"), ("operate", operate)):
         values = commands.add_parser(name, help=f"change {words}")
         values.add_argument("values", metavar="NAME=VALUE", nargs="+", help="of one or more signals, in their units")
+    commands.choices["mv"].add_argument(
+        "--take", action="store_true", help="take them out of the law's use first; it keeps the others"
+    )
     course = commands.add_parser("course", help="give set points and forecasts of disturbances to come, or end them")
     known = course.add_mutually_exclusive_group(required=True)
     known.add_argument("courses", metavar="FILE.csv", type=Path, nargs="?", help="times, and values by signal")
@@ -133,6 +136,7 @@ def _ask(options: argparse.Namespace) -> int:
         value = options.mode
     elif do in {"sp", "mv", "operate"}:
         value = dict(_pair(text, written if do == "operate" else float) for text in options.values)
+        do = "by_hand" if do == "mv" and options.take else do
     elif do == "course":
         value = (
             {"points": read_courses(options.courses, time.time(), settings.speed), "straight": options.straight}

@@ -72,7 +72,8 @@ class Steered:
         m, parts = loop.controller.manifest, []
         points = [s for s in m.sp if s.name in self.sp and s.name in before.sp]
         if points:
-            parts.append(moved_words(*([of.sp[s.name] for s in points] for of in (before, self)), points, "set point"))
+            old, new = ([of.sp[s.name] for s in points] for of in (before, self))
+            parts.append(moved_words(old, new, points, "set point"))
         if self.operate:
             parts.append(operate_words(m.operate, before.operate, self.operate, m.period_s))
         return "; ".join(parts)

@@ -141,6 +141,7 @@ def change(request: Request, loop: ControlLoop, opened: Opened) -> Change:
         "mode": _mode,
         "sp": _sp,
         "mv": _mv,
+        "by_hand": _by_hand,
         "operate": _operate,
         "course": _course,
         "swap": _swap,
@@ -264,6 +265,35 @@ def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
         loop.set_mv(_numbers(request.value, signals, loop.mv_wanted.tolist(), "MV"))
 
     return Change(act, what, request.who, request.reason)
+
+
+def _by_hand(request: Request, loop: ControlLoop, _: Opened) -> Change:
+    """MVs that are taken out of the law's use, if they are not, and sent to values; the law keeps the others."""
+    signals, take = loop.controller.manifest.mv, request.value
+    wanted = _numbers(request.value, signals, loop.mv_wanted.tolist(), "MV")
+    _within(wanted, signals, request.value)
+    loop.require_in_hand(take, take)
+    entries = loop.controller.manifest.operate
+    before = dict(zip([e.name for e in entries], loop.operate.tolist(), strict=True))
+    out = {name: 0.0 for name in (f"{s.name}.use" for s in signals if s.name in take) if before.get(name)}
+    parts = [operate_words(entries, before, out, loop.controller.manifest.period_s)] if out else []
+    what = "; ".join([*parts, moved_words(loop.mv_wanted.tolist(), wanted, signals, "by hand")])
+
+    def act(loop: ControlLoop) -> None:
+        loop.set_mv(_numbers(request.value, signals, loop.mv_wanted.tolist(), "MV"), take)
+
+    return Change(act, what, request.who, request.reason)
+
+
+def _within(wanted: list[float], signals: tuple[Signal, ...], named: Mapping[str, float]) -> None:
+    """LoopError with the ``entry`` of the first value outside its range."""
+    for s, value in zip(signals, wanted, strict=True):
+        try:
+            if s.name in named:
+                within([value], (s,), "MV")
+        except LoopError as error:
+            error.entry = s.name
+            raise
 
 
 def _operate(request: Request, loop: ControlLoop, _: Opened) -> Change:
