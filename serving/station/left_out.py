@@ -1,0 +1,58 @@
+"""Process variables that operators have taken out, and that leave their range: nothing holds them there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loopwright.serving.guard import Sample
+from loopwright.serving.loop import Command
+from loopwright.serving.manifest import Manifest
+from loopwright.serving.modes import Mode
+
+Array: TypeAlias = NDArray[np.float64]
+BACK = 0.01  # of a PV's range, within its ends: noise at an end would raise and end the alarm scan by scan
+
+
+class LeftOut:
+    """Raises an alarm while a PV that somebody has taken out is outside the range that operators gave it.
+
+    A PV that is left out for its reading has an alarm of its own, and no number to judge. In another mode than AUTO
+    somebody else has the plant.
+    """
+
+    def __init__(self, say: Callable[[str, str, bool], None]) -> None:
+        self._say = say  # words, name of the PV, raised or over
+        self._gone: Mapping[str, str] = {}
+
+    def look(self, m: Manifest, operate: Array, sample: Sample | None, command: Command) -> None:
+        """Say what has changed at a scan, with the present ``operate`` (n_operate,) of the law with manifest ``m``."""
+        if sample is None or command.law_mv is None or not m.operate:
+            return
+        of = dict(zip([e.name for e in m.operate], operate.tolist(), strict=True))
+        gone: dict[str, str] = {}
+        for s, value in zip(m.pv, sample.pv.tolist(), strict=False):
+            if (
+                command.mode is not Mode.AUTO
+                or of.get(f"{s.name}.use", 1.0)
+                or s.name in command.shed
+                or s.name in command.bridged
+            ):
+                continue
+            low, high = of.get(f"{s.name}.low", s.low), of.get(f"{s.name}.high", s.high)
+            # One that has gone is back only well inside.
+            inside = BACK * (s.high - s.low) if s.name in self._gone else 0.0
+            if value > high - inside:
+                gone[s.name] = f"above its high limit of {high:g} {s.unit}".rstrip()
+            elif value < low + inside:
+                gone[s.name] = f"below its low limit of {low:g} {s.unit}".rstrip()
+        for name, why in gone.items():
+            if name not in self._gone:
+                self._say(f"PV {name} is taken out, and {why}: nothing holds it", name, True)
+        for name in self._gone:
+            if name not in gone:
+                self._say(f"over: PV {name} is within its range, or controlled again", name, False)
+        self._gone = gone
