@@ -350,6 +350,10 @@ class ControlLoop:
             self._mv = self._out.without(self._mv, self._transfer.limited(step.mv, applied))
         elif self.mode is Mode.SHADOW:
             self._mv = applied.copy()
+        try:
+            self._active.learn(self._mv)
+        except Exception as error:  # the MV of this scan is known; the next one begins without a past
+            self._active.begin_cold(first_line(error))
         before = self.controller
         beside = self._active.beside(readings.sample, self._sp, applied, self._out.local.away, held, self._out.those)
         if self.controller is not before:
