@@ -14,7 +14,7 @@ from loopwright.serving.manifest import Manifest
 from loopwright.serving.modes import Mode
 
 Array: TypeAlias = NDArray[np.float64]
-BACK = 0.01  # of a PV's range, within its ends: noise at an end would raise and end the alarm scan by scan
+WELL_INSIDE = 0.01  # of a PV's range, within its ends: noise at an end would raise and end the alarm scan by scan
 
 
 class LeftOut:
@@ -44,7 +44,7 @@ class LeftOut:
                 continue
             low, high = of.get(f"{s.name}.low", s.low), of.get(f"{s.name}.high", s.high)
             # One that has gone is back only well inside.
-            inside = BACK * (s.high - s.low) if s.name in self._gone else 0.0
+            inside = WELL_INSIDE * (s.high - s.low) if s.name in self._gone else 0.0
             if value > high - inside:
                 gone[s.name] = f"above its high limit of {high:g} {s.unit}".rstrip()
             elif value < low + inside:

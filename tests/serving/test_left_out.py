@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from loopwright.serving import Controller, ControlLoop, Mode, Sample
-from loopwright.serving.station.left_out import BACK, LeftOut
+from loopwright.serving.station.left_out import WELL_INSIDE, LeftOut
 
 pytest_plugins = ["small_laws", "operated_files"]
 NAN = float("nan")
@@ -43,7 +43,7 @@ def test_it_is_raised_once_and_over_well_inside(operated: Controller, beyond: fl
     assert made.scan(beyond) == [("T", True)]
     assert made.scan(beyond) == []
     assert made.scan(inside) == []  # noise at the end of the range raises nothing anew
-    assert made.scan(inside + np.sign(300.0 - inside) * 1.5 * BACK * (t.high - t.low)) == [("T", False)]
+    assert made.scan(inside + np.sign(300.0 - inside) * 1.5 * WELL_INSIDE * (t.high - t.low)) == [("T", False)]
 
 
 def test_one_that_is_taken_back_in_is_over(operated: Controller) -> None:

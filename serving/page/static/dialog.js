@@ -60,7 +60,7 @@ function moves() {
     .filter(([given]) => given.now !== undefined)
     .map(([given, input]) => {
       const to = input.selectedOptions ? input.selectedOptions[0].textContent : input.value;
-      return `${given.said || given.name}: ${given.now || "–"} → ${to || "…"} ${given.unit}`.trim();
+      return `${given.said ? `${given.said}:` : given.name} ${given.now || "–"} → ${to || "…"} ${given.unit}`.trim();
     });
   say($("dialog-moves"), said.join(", "));
 }
