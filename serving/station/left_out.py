@@ -3,17 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
 
 from loopwright.serving.guard import Sample
-from loopwright.serving.loop import Command
-from loopwright.serving.manifest import Manifest
+from loopwright.serving.loop import Command, ControlLoop
 from loopwright.serving.modes import Mode
 
-Array: TypeAlias = NDArray[np.float64]
 WELL_INSIDE = 0.01  # of a PV's range, within its ends: noise at an end would raise and end the alarm scan by scan
 
 
@@ -28,12 +22,12 @@ class LeftOut:
         self._say = say  # words, name of the PV, raised or over
         self._gone: Mapping[str, str] = {}
 
-    def look(self, m: Manifest, operate: Array, sample: Sample | None, command: Command) -> None:
-        """Say what has changed at a scan, with the present ``operate`` (n_operate,) of the law with manifest ``m``."""
-        if sample is None or command.law_mv is None or not m.operate:
+    def look(self, loop: ControlLoop, sample: Sample | None, command: Command) -> None:
+        """Say what has changed at a scan of ``loop``; one without a sample, or a step of the law, says nothing."""
+        if sample is None or command.law_mv is None:
             return
-        of = dict(zip([e.name for e in m.operate], operate.tolist(), strict=True))
-        gone: dict[str, str] = {}
+        m, gone = loop.controller.manifest, dict[str, str]()
+        of = dict(zip([e.name for e in m.operate], loop.operate.tolist(), strict=True)) if m.operate else {}
         for s, value in zip(m.pv, sample.pv.tolist(), strict=False):
             if (
                 command.mode is not Mode.AUTO

@@ -90,7 +90,7 @@ class Recorder:
             what = lasting(command.fault) or f"over: {lasting(before)}"
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.fault))
         self._bridged(command)
-        self._left_out.look(loop.controller.manifest, loop.operate, sample, command)
+        self._left_out.look(loop, sample, command)
         for name in loop.courses.finished:
             self.note("change", "loop", f"the course of {name} is over")
         self._taken(command)

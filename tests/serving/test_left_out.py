@@ -30,7 +30,7 @@ class Watched:
         """What was said at a scan with this reading."""
         sample = replace(Sample(np.array([t, 5.0, 0.5]), np.array([40.0, 0.5])), **changed)
         command, before = self.loop.scan(sample), len(self.said)
-        self.left_out.look(self.loop.controller.manifest, self.loop.operate, sample, command)
+        self.left_out.look(self.loop, sample, command)
         return self.said[before:]
 
 

@@ -52,7 +52,7 @@ function leftOut() {
   if ($("left-out").dataset.of === text) return;
   $("left-out").dataset.of = text;
   $("left-out").hidden = !found.length;
-  $("left-out").replaceChildren(...found.map(({ name, words }) => element("li", { "data-out": name }, element("strong", {}, name), ` left out: ${words}`)));
+  $("left-out").replaceChildren(...found.map(({ name, words }) => element("li", { "data-out": name }, element("strong", {}, name), ` ${words}`)));
 }
 
 // A block a signal: its values side by side, and a bar of its range. It is laid out once, and then filled.

@@ -157,8 +157,11 @@ function byHand(signal, i) {
 // The signals that the law does not have, each with the reason.
 export function leftOut(state, { pv, mv }) {
   given = state;
-  const why = (group, signal) =>
-    given.shed?.[signal.name] || given.local?.[signal.name] || (of(signal, "use") === 0 ? { pv: "taken out", mv: "by hand" }[group] : "");
+  const why = (group, { name }) => {
+    if (given.shed?.[name]) return `left out: ${given.shed[name]}`;
+    if (given.local?.[name]) return `the plant has it: ${given.local[name]}`;
+    return value(`${name}.use`) === 0 ? { pv: "taken out: not controlled", mv: "by hand" }[group] : "";
+  };
   const all = [...pv.map((s) => [s, why("pv", s)]), ...mv.map((s) => [s, why("mv", s)])];
   return all.filter(([, words]) => words).map(([s, words]) => ({ name: s.name, words }));
 }
