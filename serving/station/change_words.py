@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 
 from loopwright.serving.manifest import OperateEntry, Signal
@@ -56,6 +56,17 @@ def _words(e: OperateEntry, old: float | None, new: float, period_s: float) -> s
     unit = unit_words(e, period_s)
     change = f"{new:g}" if old is None else f"{old:g} -> {new:g}"
     return f"{NAMED.get(e.what, e.what)} {change} {unit}".rstrip(" -")
+
+
+def by_hand_words(
+    before: Sequence[float], wanted: Sequence[float], signals: Sequence[Signal], taken: Collection[str]
+) -> str:
+    """Where operators send ``signals`` (n,) by hand: ``FV-2 taken out, by hand 33 -> 30 %`` for one of ``taken``."""
+    words = []
+    for s, old, new in zip(signals, before, wanted, strict=True):
+        way = f"at {new:g}" if old == new else f"{old:g} -> {new:g}"
+        words.append(f"{s.name} {'taken out, ' if s.name in taken else ''}by hand {way} {s.unit}".rstrip(" -"))
+    return "; ".join(words)
 
 
 def moved_words(before: Sequence[float], wanted: Sequence[float], signals: Sequence[Signal], what: str) -> str:

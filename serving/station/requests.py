@@ -18,7 +18,7 @@ from loopwright.serving.manifest import Signal
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.preview.course import described
 from loopwright.serving.preview.course_file import courses_of
-from loopwright.serving.station.change_words import moved_words, operate_words
+from loopwright.serving.station.change_words import by_hand_words, moved_words, operate_words
 from loopwright.serving.station.recorder import named
 from loopwright.serving.trust import require_accepted, signer
 
@@ -273,11 +273,11 @@ def _by_hand(request: Request, loop: ControlLoop, _: Opened) -> Change:
     wanted = _numbers(request.value, signals, loop.mv_wanted.tolist(), "MV")
     _within(wanted, signals, request.value)
     loop.require_in_hand(take, take)
-    entries = loop.controller.manifest.operate
-    before = dict(zip([e.name for e in entries], loop.operate.tolist(), strict=True))
-    out = {name: 0.0 for name in (f"{s.name}.use" for s in signals if s.name in take) if before.get(name)}
-    parts = [operate_words(entries, before, out, loop.controller.manifest.period_s)] if out else []
-    what = "; ".join([*parts, moved_words(loop.mv_wanted.tolist(), wanted, signals, "by hand")])
+    places = [i for i, s in enumerate(signals) if s.name in take]
+    of = dict(zip([e.name for e in loop.controller.manifest.operate], loop.operate.tolist(), strict=True))
+    old, new = ([values[i] for i in places] for values in (loop.mv_wanted.tolist(), wanted))
+    taken = [name for name in take if of.get(f"{name}.use")]
+    what = by_hand_words(old, new, [signals[i] for i in places], taken)
 
     def act(loop: ControlLoop) -> None:
         loop.set_mv(_numbers(request.value, signals, loop.mv_wanted.tolist(), "MV"), take)

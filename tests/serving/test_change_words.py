@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from loopwright.serving.manifest import OperateEntry, What
+from loopwright.serving.manifest import OperateEntry, Signal, What
 from loopwright.serving.operating import unit_words
-from loopwright.serving.station.change_words import operate_words
+from loopwright.serving.station.change_words import by_hand_words, operate_words
 
 
 def entry(group: str, signal: str, what: What, unit: str = "") -> OperateEntry:
@@ -62,3 +62,13 @@ def test_a_cost_and_a_largest_move_say_of_which_time_they_are() -> None:
         assert "10 s" in said
         assert "1/" not in said
     assert "10 s" in words(FV3_cost=2)
+
+
+def test_an_mv_by_hand_is_named_once() -> None:
+    valve = Signal("FV-2", "%", 0.0, 100.0)
+    taken, again, there = (
+        by_hand_words([33.0], [to], [valve], out) for to, out in ((30.0, ["FV-2"]), (30.0, []), (33.0, ["FV-2"]))
+    )
+    assert [line.count("FV-2") for line in (taken, again, there)] == [1, 1, 1]
+    assert ["taken out" in line for line in (taken, again, there)] == [True, False, True]
+    assert ["33 -> 30 %" in line for line in (taken, again, there)] == [True, True, False]
