@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -195,6 +195,22 @@ def _known(controller: Controller, courses: Courses | None, sp: Array, sample: S
     return {} if found is None else {"ahead": found}
 
 
+def _learnt(
+    controller: Controller, entries: MvEntries, given: Mapping[str, Any], gave: Array, commanded: Array, out: Those
+) -> Step | None:
+    """The step from the inputs ``given`` after which the law goes on from what is ``commanded`` (n_mv,).
+
+    A law takes what it ``gave`` (n_mv,) for the command, and a read-back beside it up to ``READ_BACK_MARGIN`` for an
+    actuator's offset. While somebody else commands the MVs, it would walk away from them by so much, and a change to
+    AUTO would jump there. None where it has nothing to learn. MVs ``out`` (n_mv,) of use have their own way.
+    """
+    other = (gave != commanded) & entries.able & ~out
+    if not other.any() or np.isnan(commanded).any():  # a law without `operate` can do without none
+        return None
+    told = entries.told(np.array(given["operate"], dtype=np.float64), other, commanded, gave)
+    return controller.step(**{**given, "operate": told})
+
+
 class Successor:
     """Steps a new controller on the samples of the one in charge; its MV is shown and not written.
 
@@ -213,6 +229,7 @@ class Successor:
         self.state = controller.cold_state()
         self.good = 0
         self.mv: Array | None = None  # shape: (n_mv,), of the last scan; None where there is none
+        self._given: Array | None = None  # shape: (n_mv,), what the law goes on from
         self.reason = ""  # why the last scan gave no MV
 
     def step(
@@ -253,18 +270,29 @@ class Successor:
         try:
             used, entries = self.bridging.used(self.operate, readings), self.mv_entries
             out = ~entries.used(self.operate) | (entries.able & (False if away is None else away))
-            more = _inputs(self.controller, readings, entries.told(used, out, held, self.mv))
+            more = _inputs(self.controller, readings, entries.told(used, out, held, self._given))
             more |= _known(self.controller, courses, sp, sample)
-            step: Step = self.controller.step(sp=sp, dv=sample.dv, mv_applied=applied, state=self.state, **more)
+            inputs = {"sp": sp, "dv": sample.dv, "mv_applied": applied, "state": self.state, **more}
+            step: Step = self.controller.step(**inputs)
+            commanded = applied if held is None else held
+            learnt = _learnt(self.controller, entries, inputs, step.mv, commanded, out) or step
         except Exception as error:  # the controller in charge goes on, whatever this one does
             self.miss(named(error))
             return
-        self.mv, self.state, self.reason = step.mv, step.state, ""
+        # It is shown as the law gives it; the law goes on from what is commanded.
+        self.mv, self.state, self.reason = np.array(step.mv), learnt.state, ""
+        self._given = np.array(learnt.mv)
         self.good += 1
 
     def miss(self, reason: str) -> None:
         """A scan without a sample: no past any more."""
         self.mv, self.state, self.good, self.reason = None, self.controller.cold_state(), 0, reason
+        self._given = None
+
+    @property
+    def given(self) -> Array | None:
+        """The MV (n_mv,) that its law goes on from; None without a past."""
+        return self._given
 
     @property
     def ready(self) -> bool:
@@ -316,7 +344,8 @@ class ActiveController:
         self.mv_entries = MvEntries(controller.manifest)
         self._state = controller.cold_state()
         self.stepped: LawInputs | None = None
-        self._given: Array | None = None  # shape: (n_mv,), what the law gave last; None without a past
+        self._given: Array | None = None  # shape: (n_mv,), what the law goes on from; None without a past
+        self._inputs: tuple[Mapping[str, Any], Those] | None = None  # of the last step, and the MVs out of use at it
         self._past = deque[Sample](maxlen=_longest(self.guards))
         self._before: tuple[Sample, ...] = ()  # the past of the present sample, for the successor
 
@@ -380,7 +409,17 @@ class ActiveController:
         if self._past.maxlen:
             self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
         self._state, self._given = step.state, np.array(step.mv)  # the host gets step.mv, may write into it
+        self._inputs = given, out
         return step
+
+    def learn(self, commanded: Array) -> None:
+        """Let the law go on from what is ``commanded`` (n_mv,) after its last step, where that is not what it gave."""
+        if self._inputs is None or self._given is None:
+            return
+        given, out = self._inputs
+        learnt = _learnt(self.controller, self.mv_entries, given, self._given, commanded, out)
+        if learnt is not None:
+            self._state, self._given = learnt.state, np.array(learnt.mv)
 
     def beside(
         self,
@@ -399,7 +438,7 @@ class ActiveController:
         if new.ready:
             self.replaced, self.successor = self.controller, None
             self.controller, self._state, self.stepped = new.controller, new.state, None
-            self._given = new.mv
+            self._given, self._inputs = new.given, None
             self.operating, self.operate, self._bridging = new.operating, new.operate, new.bridging
             self.mv_entries = new.mv_entries
             if self._made is not None:
@@ -428,7 +467,7 @@ class ActiveController:
 
     def begin_cold(self, reason: str) -> None:
         """The laws know nothing of what was."""
-        self._state, self._given = self.controller.cold_state(), None
+        self._state, self._given, self._inputs = self.controller.cold_state(), None, None
         if self.successor is not None:
             self.successor.miss(reason)
 

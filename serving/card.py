@@ -14,6 +14,7 @@ from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.loop import WARM_LEAD_S
 from loopwright.serving.manifest import SWITCHES, OperateEntry, Signal
+from loopwright.serving.operating import unit_words
 from loopwright.serving.trust import ending, judged, signer
 from loopwright.serving.words import plain
 
@@ -53,7 +54,7 @@ def card(controller: Controller) -> str:
         idle = " (this law does not take them)" * (name == "dv" and "dv" not in m.inputs)
         lines += _signals(title + idle, m.signals(name))
     lines += _signals("manipulated variables", m.mv)
-    lines += _operate(m.operate if "operate" in m.inputs else ())
+    lines += _operate(m.operate if "operate" in m.inputs else (), m.period_s)
     outputs = ["mv"] + ["state_next"] * bool(m.n_state) + ["info"] * bool(m.info)
     lines += ["", f"inputs      {', '.join(m.inputs)}", f"outputs     {', '.join(outputs)}"]
     lines += [f"state       {m.n_state} numbers, all zero: no past", f"info        {', '.join(m.info) or '-'}"]
@@ -85,14 +86,16 @@ def _signals(title: str, signals: tuple[Signal, ...]) -> list[str]:
     return ["", title, *rows]
 
 
-def _operate(entries: tuple[OperateEntry, ...]) -> list[str]:
+def _operate(entries: tuple[OperateEntry, ...], period_s: float) -> list[str]:
     """A table of what operators may change: name, default, engineered range, unit."""
     if not entries:
         return []
     rows = [("name", "default", "allowed", "unit")]
     for e in entries:
         switched = e.what in SWITCHES and e.low < e.high
-        rows.append((e.name, f"{e.default:g}", "0 or 1" if switched else f"{e.low:g} .. {e.high:g}", e.unit))
+        rows.append(
+            (e.name, f"{e.default:g}", "0 or 1" if switched else f"{e.low:g} .. {e.high:g}", unit_words(e, period_s))
+        )
     name, default, allowed, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
     lines = [f"  {n:<{name}}  {d:>{default}}  {a:<{allowed}}  {u}".rstrip() for n, d, a, u in rows]
     return ["", "what operators may change (operate)", *lines]

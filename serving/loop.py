@@ -274,22 +274,30 @@ class ControlLoop:
         """``operate`` (n_operate,) as ``set_operate`` would leave it; LoopError where that would refuse."""
         return self._active.operate_with(values)
 
-    def set_mv(self, mv: ArrayLike) -> None:
+    def set_mv(self, mv: ArrayLike, take: Collection[str] = ()) -> None:
         """Set the MV (n_mv,) by hand; one with a ``max_move`` goes there scan by scan, see ``mv_wanted``.
 
-        LoopError outside its range, for a change that ``require_in_hand`` refuses, and until it is known where the MV
-        stands after a command that did not reach the plant.
+        The MVs named in ``take`` are taken out of the law's use with it. LoopError outside its range, for a change that
+        ``require_in_hand`` refuses, and until it is known where the MV stands after a command that did not reach the
+        plant; then nothing is changed.
         """
-        wanted = within(mv, self.controller.manifest.mv, "MV")
-        self.require_in_hand(self._out.others(self._mv, wanted))
+        signals = self.controller.manifest.mv
+        wanted = within(mv, signals, "MV")
+        self.require_in_hand({*self._out.others(self._mv, wanted), *take}, take)
         if self._applied.lost:
             raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
-        self._mv = self._out.hand.sent(self._mv, wanted, self.controller.manifest.mv)
+        taken = np.array([s.name in take for s in signals]) & ~self._active.in_hand
+        if taken.any():
+            self.set_operate({f"{s.name}.use": 0.0 for s, of in zip(signals, taken.tolist(), strict=True) if of})
+        self._mv = self._out.hand.sent(self._mv, wanted, signals, taken)
         self._took_over = self._took_over and self._out.hand.wanted is not None  # else the MV is where it was sent
 
-    def require_in_hand(self, names: Collection[str]) -> None:
-        """LoopError unless operators have these MVs in hand: all in MANUAL, those of ``use`` 0 in AUTO and HOLD."""
-        self._out.require(names, self.mode, self._active.mv_entries, self._active.operate)
+    def require_in_hand(self, names: Collection[str], take: Collection[str] = ()) -> None:
+        """LoopError unless operators have these MVs in hand: all in MANUAL, those of ``use`` 0 in AUTO and HOLD.
+
+        Those named in ``take`` may also be the law's, where it can do without them.
+        """
+        self._out.require(names, self.mode, self._active.mv_entries, self._active.operate, take)
 
     def hand_back(self) -> None:
         """The plant is with its own controller now: this loop writes no more, until the mode is set again."""
@@ -342,6 +350,10 @@ class ControlLoop:
             self._mv = self._out.without(self._mv, self._transfer.limited(step.mv, applied))
         elif self.mode is Mode.SHADOW:
             self._mv = applied.copy()
+        try:
+            self._active.learn(self._mv)
+        except Exception as error:  # the MV of this scan is known; the next one begins without a past
+            self._active.begin_cold(first_line(error))
         before = self.controller
         beside = self._active.beside(readings.sample, self._sp, applied, self._out.local.away, held, self._out.those)
         if self.controller is not before:

@@ -20,7 +20,18 @@ def allowed(entry: OperateEntry) -> str:
     """The values that an entry may have, in words."""
     if entry.low == entry.high:
         return f"{entry.low:g} alone"
-    return "0 or 1" if entry.what in SWITCHES else f"{entry.low:g} to {entry.high:g} {entry.unit}".rstrip()
+    return "0 or 1" if entry.what in SWITCHES else f"{entry.low:g} to {entry.high:g} {unit_words(entry)}".rstrip()
+
+
+def unit_words(entry: OperateEntry, period_s: float | None = None) -> str:
+    """The unit of an entry in words; ``period_s`` [s] of the law, where it is known.
+
+    A cost is the price of one unit of its signal over one period.
+    """
+    period = "period" if period_s is None else f"period ({period_s:g} s)"
+    if entry.what == "cost":
+        return f"per {entry.unit.removeprefix('1/')} and {period}".replace("per  and", "per unit and")
+    return f"{entry.unit} a {period}".lstrip() if entry.what == "max_move" else entry.unit
 
 
 def written(text: str) -> float:

@@ -194,6 +194,9 @@ class Explainer:
         entries = Operate(m.operate)
         operate = entries.default if given.operate is None else np.asarray(given.operate)
         idle = {e.signal for e, v in zip(m.operate, operate, strict=True) if (e.group, e.what, v) == ("mv", "use", 0)}
+        rests = {e.signal: v for e, v in zip(m.operate, operate, strict=True) if (e.group, e.what) == ("mv", "rest")}
+        applied = np.array(given.mv_applied, dtype=np.float64, ndmin=1).tolist()
+        to_rest = {s.name: rests[s.name] - at for s, at in zip(m.mv, applied, strict=True) if s.name in rests}
         rows = found["parts"].reshape(len(m.mv), len(causes))
         moves = []
         for s, move, row in zip(m.mv, found["move"].tolist(), rows.tolist(), strict=True):
@@ -201,7 +204,7 @@ class Explainer:
             parts = [MovePart(cast("Cause", c), n, v) for (c, n), v in zip(causes, row, strict=True)]
             parts = sorted((p for p in parts if abs(p.value) > NO_PART * span), key=lambda p: -abs(p.value))
             parts = parts or [MovePart("not_in_use", s.name, move) if s.name in idle else MovePart("plan", "", move)]
-            words = sentence_of(move, span, parts, news)
+            words = sentence_of(move, span, parts, news, {s.name: to_rest.get(s.name, 0.0)})
             moves.append(ExplainedMove(s.name, s.unit, move, tuple(parts), words))
         return tuple(moves)
 

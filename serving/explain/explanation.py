@@ -128,41 +128,56 @@ class WhatIf:
 
 
 # ------------------------------------------------------------------------------------------------ a move in plain words
-LEAST_SHARE = 0.05  # of a side's sum: a smaller part is not named
+LEAST_SHARE = 0.05  # of a side's sum: a smaller part is not named, nor a side whose sum is smaller beside the other's
 MOST_NAMED = 3  # parts of a side: more than that nobody reads
 STANDS = 5e-4  # of an MV's range: a smaller move is none
 
 
-def sentence_of(move: float, span: float, parts: Sequence[MovePart], news: Mapping[str, float]) -> str:
+def sentence_of(
+    move: float,
+    span: float,
+    parts: Sequence[MovePart],
+    news: Mapping[str, float],
+    to_rest: Mapping[str, float] | None = None,
+) -> str:
     """A move [mv] of an MV whose range is ``span`` [mv] wide, by its ``parts``.
 
     ``news`` by the name of a signal: by how much a measured disturbance changed, or a reading is above the
-    predicted one.
+    predicted one. ``to_rest`` by the name of the MV itself: how far its resting value is above where it stands. The
+    plan may go to that in a roundabout way, and its part of the first move points away from it; the words say so.
     """
+    way = {} if to_rest is None else to_rest
+    away = {p.signal for p in parts if p.cause == "rest" and p.value * way.get(p.signal, 0.0) < 0}
+    names = {p: words(p, news, roundabout=p.signal in away) for p in parts}
     least = STANDS * span
     if abs(move) <= least:
         held = [p for p in parts if abs(p.value) > least]
         if not held:
             return "stands: nothing asks for a move"
         one, other = ([p for p in held if (p.value > 0) is up] for up in (True, False))
-        both = "; against it ".join(filter(None, (_listed(one, news), _listed(other, news))))
+        both = "; against it ".join(filter(None, (_listed(one, names), _listed(other, names))))
         return f"stands: {both}"
     ahead, back = (
         [p for p in parts if (p.value * move > 0) is same and abs(p.value) > least] for same in (True, False)
     )
-    return "; held back by ".join(_listed(side, news) for side in (ahead, back) if side)
+    least = LEAST_SHARE * max(_sum(ahead), _sum(back))
+    return "; held back by ".join(_listed(side, names) for side in (ahead, back) if side and _sum(side) >= least)
 
 
-def _listed(parts: Sequence[MovePart], news: Mapping[str, float]) -> str:
+def _sum(side: Sequence[MovePart]) -> float:
+    return sum(abs(p.value) for p in side)
+
+
+def _listed(parts: Sequence[MovePart], names: Mapping[MovePart, str]) -> str:
     """The largest parts of one side with their shares of that side's sum."""
-    whole = sum(abs(p.value) for p in parts)
+    whole = _sum(parts)
     largest = sorted(parts, key=lambda p: -abs(p.value))[:MOST_NAMED]
     named = [p for p in largest if abs(p.value) >= LEAST_SHARE * whole] or largest[:1]
-    return "; ".join(f"{100 * abs(p.value) / whole:.0f} %: {words(p, news)}" for p in named)
+    return "; ".join(f"{100 * abs(p.value) / whole:.0f} %: {names[p]}" for p in named)
 
 
-def words(part: MovePart, news: Mapping[str, float]) -> str:
-    """A cause in words."""
+def words(part: MovePart, news: Mapping[str, float], *, roundabout: bool = False) -> str:
+    """A cause in words; ``roundabout``: the part of a resting value points away from it."""
     name, up = part.signal, news.get(part.signal, 0.0) >= 0
     return {
         "setpoint": f"{name} towards its set point",
@@ -172,7 +187,7 @@ def words(part: MovePart, news: Mapping[str, float]) -> str:
         "forecast": f"{name} as it is to come",
         "load": f"something not measured {'raises' if up else 'lowers'} {name}",
         "cost": f"cost of {name}",
-        "rest": f"{name} to its resting value",
+        "rest": f"{name} to its resting value{', first the other way' if roundabout else ''}",
         "mv_low": f"{name} at its low limit",
         "mv_high": f"{name} at its high limit",
         "max_move": f"{name} moves no faster",

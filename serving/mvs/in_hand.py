@@ -24,9 +24,13 @@ class ByHand:
     def __init__(self) -> None:
         self.wanted: Array | None = None  # shape: (n_mv,), NaN of those that are there; None: nobody moves any by hand
 
-    def sent(self, mv: Array, wanted: Array, signals: Sequence[Signal]) -> Array:
-        """Begin the way to ``wanted`` (n_mv,); the MV from now on, which is there already where it is not limited."""
+    def sent(self, mv: Array, wanted: Array, signals: Sequence[Signal], taken: Those | None = None) -> Array:
+        """Begin the way to ``wanted`` (n_mv,); the MV from now on, which is there already where it is not limited.
+
+        Those ``taken`` (n_mv,) out of use with it begin at the next scan, which shows where they stand.
+        """
         limited = np.array([s.most < np.inf for s in signals])
+        limited = limited if taken is None else limited | taken
         if limited.any() and np.isnan(mv).any():  # not known where they stand: nothing is written until it is
             limited[:] = True
         self.wanted = np.where(limited, wanted, np.nan)

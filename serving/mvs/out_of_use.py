@@ -53,15 +53,19 @@ class OutOfUse:
             [name.removesuffix(".use") for name, value in values.items() if value and name.endswith(".use")]
         )
 
-    def require(self, names: Collection[str], mode: Mode, entries: MvEntries, operate: Array) -> None:
+    def require(
+        self, names: Collection[str], mode: Mode, entries: MvEntries, operate: Array, take: Collection[str] = ()
+    ) -> None:
         """LoopError where an operator cannot move one of these MVs now, see ``ControlLoop.require_in_hand``."""
         free = mode in {Mode.AUTO, Mode.HOLD} and bool(entries.able.any())
         if not free and mode is not Mode.MANUAL:
             raise LoopError(f"the MV is set by hand in MANUAL only; the loop is in {mode}")
-        for s, used in zip(self._signals, entries.used(operate).tolist(), strict=True):
+        for s, used, able in zip(self._signals, entries.used(operate).tolist(), entries.able.tolist(), strict=True):
             if s.name in names and s.name in self.local.why:
                 raise LoopError(f"the plant has the MV {s.name} itself: {self.local.why[s.name]}")
-            if s.name in names and free and used:
+            if s.name in take and not able:
+                raise LoopError(f"the law cannot do without the MV {s.name}; set it by hand in MANUAL")
+            if s.name in names and s.name not in take and free and used:
                 raise LoopError(f"the law has the MV {s.name}; take it in hand first: operate {s.name}.use=0")
 
     def follow(self, mv: Array, applied: Array | None, standing: AppliedMV, mode: Mode, in_hand: Those) -> Array:

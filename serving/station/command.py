@@ -15,6 +15,7 @@ from contextlib import closing, suppress
 from dataclasses import fields
 from math import isnan
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from loopwright.serving.trust import Controller, ending, judged
 from loopwright.serving.words import plain
 
 SETTINGS = Path("loop.toml")
+OWN_ADDRESSES = frozenset({"localhost", "127.0.0.1", "::1"})
 JOURNAL_LOST = 3  # exit status of a loop whose journal lacks scans or events
 
 
@@ -89,6 +91,9 @@ def _asking(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> No
     for name, words in (("sp", "set points"), ("mv", "MVs by hand, in MANUAL or out of use"), ("operate", operate)):
         values = commands.add_parser(name, help=f"change {words}")
         values.add_argument("values", metavar="NAME=VALUE", nargs="+", help="of one or more signals, in their units")
+    commands.choices["mv"].add_argument(
+        "--take", action="store_true", help="take them out of the law's use first; it keeps the others"
+    )
     course = commands.add_parser("course", help="give set points and forecasts of disturbances to come, or end them")
     known = course.add_mutually_exclusive_group(required=True)
     known.add_argument("courses", metavar="FILE.csv", type=Path, nargs="?", help="times, and values by signal")
@@ -133,6 +138,7 @@ def _ask(options: argparse.Namespace) -> int:
         value = options.mode
     elif do in {"sp", "mv", "operate"}:
         value = dict(_pair(text, written if do == "operate" else float) for text in options.values)
+        do = "by_hand" if do == "mv" and options.take else do
     elif do == "course":
         value = (
             {"points": read_courses(options.courses, time.time(), settings.speed), "straight": options.straight}
@@ -228,7 +234,7 @@ def _check(options: argparse.Namespace) -> int:
     notes += others_since(
         nodes_before(settings.journal.file), {r.signal: KnownNode(r.node, r.kind, r.unit, r.limits) for r in rows}
     )
-    for note in [*notes, *here.notes, *_unproven(manifest), *_warnings(settings), *ending(controller)]:
+    for note in [*notes, *here.notes, *_unproven(manifest), *doubts(settings), *ending(controller)]:
         print(plain(f"note: {note}"))
     for line in wrong:
         print(plain(f"would stop the loop: {line}"), file=sys.stderr)
@@ -242,18 +248,24 @@ def _unproven(manifest: Manifest) -> list[str]:
     return [f"{manifest.law} is {verdict.words}"] if verdict.why else []
 
 
-def _warnings(settings: Settings) -> list[str]:
+def doubts(settings: Settings, *, running: bool = False) -> list[str]:
+    """Lines on what is not secured; on the page of a ``running`` loop none that a plant for trials raises by itself."""
     server = settings.server
     return [
         *["neither sha256 nor trusted is set: any controller in that file would run"]
         * (not settings.sha256 and settings.trusted is None),
         *["security is None: what is sent can be read and changed on the way"] * (server.security == "None"),
         *["server_certificate is not set: any server at that address is believed"]
-        * (server.security != "None" and server.server_certificate is None),
+        * (server.security != "None" and server.server_certificate is None and not (running and _is_trial(settings))),
         *["no heartbeat: the plant cannot know whether this loop lives"] * (not settings.nodes.heartbeat),
         *["no watchdog: a server that shows old values is known by their source times alone"]
         * (not settings.nodes.watchdog),
     ]
+
+
+def _is_trial(settings: Settings) -> bool:
+    """Whether the plant is a simulated one, or at this machine's own address: nobody stands between it and the loop."""
+    return settings.speed != 1 or urlsplit(settings.server.endpoint).hostname in OWN_ADDRESSES
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -271,7 +283,7 @@ def _run(options: argparse.Namespace) -> int:
         print(plain(line), flush=True)
 
     station = Station(settings, tell=tell, controller=controller)
-    station.warnings = [*_unproven(station.manifest), *_warnings(settings)]
+    station.warnings = [*_unproven(station.manifest), *doubts(settings, running=True)]
     for line in station.warnings + station.ending():
         station.tell(f"note: {line}")
     station.watch(_Lines(station.manifest, station.tell).show)

@@ -14,6 +14,7 @@ from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import is_number
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.loop import ControlLoop
+from loopwright.serving.station.change_words import moved_words, operate_words
 from loopwright.serving.words import first_line
 
 STEERED = "steered"  # what it is kept under
@@ -57,35 +58,43 @@ class Steered:
         text = json.dumps({"sha256": self.sha256, "sp": dict(self.sp), "operate": dict(self.operate)})
         journal.keep(STEERED, text)
 
-    def lost(self, loop: ControlLoop) -> dict[str, str]:
-        """The values that stand otherwise in ``loop``: each in words, and how it stands now."""
-        m, now = loop.controller.manifest, Steered.of(loop)
-        entries = {e.name: (e.unit, v) for e, v in zip(m.operate, loop.operate.tolist(), strict=True)}
-        units = {s.name: s.unit for s in m.sp}
-        found = {
-            f"set point {name} {value:g} {units[name]}": f"{now.sp[name]:g}"
-            for name, value in self.sp.items()
-            if name in units and now.sp[name] != value
-        }
-        for name, value in self.operate.items():
-            unit, present = entries.get(name, ("", None))
-            if present != value:
-                found[f"{name} {value:g} {unit}".rstrip()] = "no entry" if present is None else f"{present:g}"
-        return found
+    def lost(self, loop: ControlLoop) -> Steered:
+        """Those of the values that stand otherwise in ``loop``."""
+        present = _present(loop)
+        return Steered(
+            self.sha256,
+            {n: v for n, v in self.sp.items() if n in present.sp and present.sp[n] != v},
+            {n: v for n, v in self.operate.items() if present.operate.get(n) != v},
+        )
+
+    def words(self, before: Steered, loop: ControlLoop) -> str:
+        """The values of this one that are others than ``before``, as a change from there; of ``loop``'s signals."""
+        m, parts = loop.controller.manifest, []
+        points = [s for s in m.sp if s.name in self.sp and s.name in before.sp]
+        if points:
+            old, new = ([of.sp[s.name] for s in points] for of in (before, self))
+            parts.append(moved_words(old, new, points, "set point"))
+        if self.operate:
+            parts.append(operate_words(m.operate, before.operate, self.operate, m.period_s))
+        return "; ".join(parts)
 
     def compare(self, loop: ControlLoop, note: Callable[[str, str], None]) -> None:
         """Say in a line what the last loop had set that stands otherwise in this one."""
-        lost = "; ".join(f"{words}, now {present}" for words, present in self.lost(loop).items())
+        lost = self.lost(loop)
         if lost:
-            note(f"the last loop ended with other values: {lost}", "restore = true in loop.toml takes them")
+            now = _present(loop).among(lost)
+            gone = [f"{n} {v:g}, which this law does not have" for n, v in lost.operate.items() if n not in now.operate]
+            words = "; ".join(filter(None, (now.words(lost, loop), *gone)))
+            why = "restore = true in loop.toml takes back what the last one ended with"
+            note(f"this loop begins with other values than the last one ended with: {words}", why)
 
     def restore(self, loop: ControlLoop, note: Callable[[str, str], None]) -> None:
         """Set these values in a loop of the same controller, and say it; one that is not valid is said, and left."""
-        lost = self.lost(loop)
+        lost, before = self.lost(loop), _present(loop)
         if not lost:
             return
         if self.sha256 != loop.controller.sha256:
-            note(f"nothing is restored: another controller had {'; '.join(lost)}", "")
+            note(f"nothing is restored: another controller had {lost.words(before, loop)}", "")
             return
         sp = [self.sp.get(s.name, v) for s, v in zip(loop.controller.manifest.sp, loop.sp.tolist(), strict=True)]
         refused = []
@@ -98,9 +107,31 @@ class Steered:
                 refused.append(first_line(error))
         if refused:
             note(f"not restored: {'; '.join(refused)}", "")
-        taken = [words for words in lost if words not in self.lost(loop)]
+        left = self.lost(loop)
+        taken = Steered(
+            self.sha256,
+            {n: v for n, v in lost.sp.items() if n not in left.sp},
+            {n: v for n, v in lost.operate.items() if n not in left.operate},
+        )
         if taken:
-            note(f"restored: {'; '.join(taken)}", "the last loop ended with them")
+            note(f"restored: {taken.words(before, loop)}", "the last loop ended so")
+
+    def among(self, others: Steered) -> Steered:
+        """These values under the names of ``others``."""
+        sp = {n: self.sp[n] for n in others.sp if n in self.sp}
+        return Steered(self.sha256, sp, {n: self.operate[n] for n in others.operate if n in self.operate})
+
+    def __bool__(self) -> bool:
+        return bool(self.sp or self.operate)
+
+
+def _present(loop: ControlLoop) -> Steered:
+    """All values of ``loop`` as they stand, also those that nobody has set."""
+    m = loop.controller.manifest
+    sp = {s.name: v for s, v in zip(m.sp, loop.sp.tolist(), strict=True)}
+    return Steered(
+        loop.controller.sha256, sp, {e.name: v for e, v in zip(m.operate, loop.operate.tolist(), strict=True)}
+    )
 
 
 def _numbers(tree: Any) -> dict[str, float]:

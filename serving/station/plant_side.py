@@ -14,6 +14,7 @@ from loopwright.serving.errors import LoopError
 from loopwright.serving.loop import ControlLoop, Mode
 from loopwright.serving.manifest import Manifest, OperateEntry, Signal
 from loopwright.serving.opcua.sampling import Values
+from loopwright.serving.station.change_words import operate_words
 from loopwright.serving.station.recorder import Recorder
 from loopwright.serving.station.requests import NodeRequests, ended_words, is_contact, require_proven
 from loopwright.serving.station.settings import Settings
@@ -72,7 +73,7 @@ class PlantSide:
         with another law, unless somebody has set another one in the loop meanwhile.
         """
         entries = {e.name: e for e in loop.controller.manifest.operate}
-        same, now = loop.controller is self._steered, dict(zip(entries, loop.operate.tolist(), strict=True))
+        same, now = loop.controller is self._steered, _standing(loop)
         again = {n: value for n, (value, before) in self._refused.items() if not same or now.get(n) == before}
         asked = {**again, **changed}
         self._steered, self._refused = loop.controller, {}
@@ -81,9 +82,8 @@ class PlantSide:
                 self._refused |= {name: (value, now.get(name)) for name, value in values.items()}
                 if not set(values) & set(changed):
                     continue  # it was said
-            units = (getattr(entries.get(name), "unit", "") for name in values)
-            words = (f"{n} {value:g} {unit}".rstrip() for (n, value), unit in zip(values.items(), units, strict=True))
-            self.carried_out(partial(loop.set_operate, values), f"operate {', '.join(words)}")
+            what = operate_words(loop.controller.manifest.operate, _standing(loop), values, self.manifest.period_s)
+            self.carried_out(partial(loop.set_operate, values), what)
 
     def set_mode(self, loop: ControlLoop, mode: Mode) -> str:
         """Set it; what is not proven of a controller that was accepted all the same."""
@@ -104,6 +104,11 @@ class PlantSide:
 def _set_sp(loop: ControlLoop, wanted: Array) -> str:
     """Set them; what is to be said beside it: courses that end by it."""
     return ended_words(loop.set_sp(wanted)).removeprefix("; ")
+
+
+def _standing(loop: ControlLoop) -> dict[str, float]:
+    """The values of ``operate`` by name."""
+    return dict(zip([e.name for e in loop.controller.manifest.operate], loop.operate.tolist(), strict=True))
 
 
 def _refusal(loop: ControlLoop, values: Mapping[str, float]) -> str:

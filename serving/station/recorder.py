@@ -22,6 +22,7 @@ from loopwright.serving.loop import Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.monitor import Monitor
 from loopwright.serving.monitor.weekly import WEEK, WeeklyCounts, counts_of, week_of
+from loopwright.serving.station.left_out import LeftOut
 from loopwright.serving.words import plain
 
 Array: TypeAlias = NDArray[np.float64]
@@ -36,6 +37,7 @@ class Recorder:
         self._fault, self._trial, self._mode = "", "", ""
         self._bad: dict[str, bool] = {}  # PVs that were bridged, or left out (True)
         self._local: Mapping[str, str] = {}  # MVs that the plant had itself
+        self._left_out = LeftOut(self._gone)
 
     @property
     def controller(self) -> Controller:
@@ -88,6 +90,7 @@ class Recorder:
             what = lasting(command.fault) or f"over: {lasting(before)}"
             self.note("fault", "loop", what, alarm="fault", raised=bool(command.fault))
         self._bridged(command)
+        self._left_out.look(loop, sample, command)
         for name in loop.courses.finished:
             self.note("change", "loop", f"the course of {name} is over")
         self._taken(command)
@@ -115,6 +118,10 @@ class Recorder:
                 words = f"PV {name} is read again"
                 self.note("fault", "loop", f"over: {words}" if before else words, alarm=alarm if before else "")
         self._bad = now
+
+    def _gone(self, what: str, name: str, raised: bool) -> None:
+        """A PV that somebody has taken out leaves its range, or is back."""
+        self.note("fault", "loop", what, alarm=f"range {name}", raised=raised)
 
     def _taken(self, command: Command) -> None:
         """Say which MVs the plant has itself, which is an alarm, and which it has given back."""

@@ -18,6 +18,7 @@ from loopwright.serving.manifest import Signal
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.preview.course import described
 from loopwright.serving.preview.course_file import courses_of
+from loopwright.serving.station.change_words import by_hand_words, moved_words, operate_words
 from loopwright.serving.station.recorder import named
 from loopwright.serving.trust import require_accepted, signer
 
@@ -140,6 +141,7 @@ def change(request: Request, loop: ControlLoop, opened: Opened) -> Change:
         "mode": _mode,
         "sp": _sp,
         "mv": _mv,
+        "by_hand": _by_hand,
         "operate": _operate,
         "course": _course,
         "swap": _swap,
@@ -184,7 +186,7 @@ def _sp(request: Request, loop: ControlLoop, _: Opened) -> Change:
     signals = loop.controller.manifest.sp
     wanted = _numbers(request.value, signals, loop.sp.tolist(), "set point")
     within(wanted, signals, "set point")
-    what = _moves(loop.sp.tolist(), wanted, signals, "set point")
+    what = moved_words(loop.sp.tolist(), wanted, signals, "set point")
     followed = [name for name in request.value if name in loop.courses.ends]
 
     def act(loop: ControlLoop) -> None:
@@ -256,7 +258,7 @@ def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
     wanted = _numbers(request.value, signals, loop.mv_wanted.tolist(), "MV")
     within(wanted, signals, "MV")
     loop.require_in_hand(request.value)
-    what = _moves(loop.mv_wanted.tolist(), wanted, signals, "MV")
+    what = moved_words(loop.mv_wanted.tolist(), wanted, signals, "MV")
 
     def act(loop: ControlLoop) -> None:
         loop.require_in_hand(request.value)
@@ -265,17 +267,44 @@ def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:
     return Change(act, what, request.who, request.reason)
 
 
+def _by_hand(request: Request, loop: ControlLoop, _: Opened) -> Change:
+    """MVs that are taken out of the law's use, if they are not, and sent to values; the law keeps the others."""
+    signals, take = loop.controller.manifest.mv, request.value
+    wanted = _numbers(request.value, signals, loop.mv_wanted.tolist(), "MV")
+    _within(wanted, signals, request.value)
+    loop.require_in_hand(take, take)
+    places = [i for i, s in enumerate(signals) if s.name in take]
+    of = dict(zip([e.name for e in loop.controller.manifest.operate], loop.operate.tolist(), strict=True))
+    old, new = ([values[i] for i in places] for values in (loop.mv_wanted.tolist(), wanted))
+    taken = [name for name in take if of.get(f"{name}.use")]
+    what = by_hand_words(old, new, [signals[i] for i in places], taken)
+
+    def act(loop: ControlLoop) -> None:
+        loop.set_mv(_numbers(request.value, signals, loop.mv_wanted.tolist(), "MV"), take)
+
+    return Change(act, what, request.who, request.reason)
+
+
+def _within(wanted: list[float], signals: tuple[Signal, ...], named: Mapping[str, float]) -> None:
+    """LoopError with the ``entry`` of the first value outside its range."""
+    for s, value in zip(signals, wanted, strict=True):
+        try:
+            if s.name in named:
+                within([value], (s,), "MV")
+        except LoopError as error:
+            error.entry = s.name
+            raise
+
+
 def _operate(request: Request, loop: ControlLoop, _: Opened) -> Change:
     entries, present = loop.controller.manifest.operate, loop.operate
     wanted = loop.operate_with(request.value)
     if not request.value:
         raise LoopError(f"a value of operate is given by name: {', '.join(e.name for e in entries)}")
-    moves = [
-        f"{e.name} {old:g} -> {new:g} {e.unit}".rstrip()
-        for e, old, new in zip(entries, present.tolist(), wanted.tolist(), strict=True)
-        if old != new
-    ]
-    what = f"operate {', '.join(moves) or 'as it was'}"
+    names = [e.name for e in entries]
+    before, after = (dict(zip(names, of.tolist(), strict=True)) for of in (present, wanted))
+    asked = {name: after[name] for name in request.value}
+    what = operate_words(entries, before, asked, loop.controller.manifest.period_s)
     return Change(lambda loop: loop.set_operate(request.value), what, request.who, request.reason)
 
 
@@ -338,12 +367,3 @@ def _numbers(value: Any, signals: tuple[Signal, ...], present: list[float], what
             raise LoopError(f"the {what} {name} is {shown(number)}; it must be a number")
         wanted[names.index(name)] = float(number)
     return wanted
-
-
-def _moves(before: list[float], wanted: list[float], signals: tuple[Signal, ...], what: str) -> str:
-    moves = [
-        f"{s.name} {old:g} -> {new:g} {s.unit}".rstrip(" -")
-        for s, old, new in zip(signals, before, wanted, strict=True)
-        if old != new
-    ]
-    return f"{what} {', '.join(moves) or 'as it was'}"

@@ -53,6 +53,7 @@ class Snapshot:
     replaced: Controller | None
     missed: int  # periods
     faults: int  # scans
+    goal: tuple[float, ...]  # where each MV goes that is moved by hand, and where the others stand
     operate: tuple[float, ...]  # as operators want it of the controller in charge
     operated: tuple[tuple[float, tuple[float, ...]], ...]  # since when these and earlier values of it hold
     inputs: LawInputs | None  # of the last step of the controller in charge
@@ -91,6 +92,7 @@ class Snapshot:
         stepped_s = seen_s if command.law_mv is not None or before is None else before.stepped_s
         return cls(
             *(seen_s, sample, command, loop.controller, stepped, successor, loop.replaced, *counts),
+            goal=tuple(map(float, loop.mv_wanted)),
             operate=operate,
             operated=operated,
             inputs=loop.stepped,
@@ -157,6 +159,7 @@ def state(station: Station) -> View:
         "pv": _plain(None if sample is None else sample.pv),
         "mv": _plain(command.mv if command.writes else None),
         "applied": _plain(applied),
+        "goal": _plain(seen.goal),
         "law": _plain(command.law_mv),
         "beside": _plain(command.successor_mv),
         "dv": _plain(None if sample is None else sample.dv),

@@ -23,8 +23,8 @@ from loopwright.serving.journal import Journal
 from loopwright.serving.opcua.inspection import _refused, _unfit, inspected
 from loopwright.serving.opcua.nameplates import other_unit
 from loopwright.serving.opcua.plan import Role, Row
-from loopwright.serving.opcua.settings import Point
-from loopwright.serving.station.command import JOURNAL_LOST
+from loopwright.serving.opcua.settings import Nodes, Point, Server
+from loopwright.serving.station.command import JOURNAL_LOST, doubts
 from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.settings import Settings
 
@@ -72,6 +72,7 @@ def test_the_way_from_a_controller_to_training_data(
     assert main(["loop", "run", "--scans", "25"]) == 0
     said = capsys.readouterr().out
     assert "loop.toml: started in AUTO" in said
+    assert "server_certificate" not in said  # nobody stands between the loop and a plant for trials
     assert "25 scans" in said or "missed" in said
     assert re.search(r"ended in (AUTO|HOLD): the plant keeps T_j at [\d.]+ K, and this loop moves it no more", said)
     for row in plant.actuator()[before:]:
@@ -463,3 +464,19 @@ def test_a_loop_that_begins_in_auto_needs_a_word_for_a_file_that_is_not_proven(
     path.write_text("accept_unproven = true\n" + path.read_text())
     assert main(["loop", "check"]) == 0
     assert "note: pid is not proven" in capsys.readouterr().out
+
+
+def test_a_server_that_is_not_pinned_is_told_of_a_real_plant_and_at_every_check() -> None:
+    """A running loop says nothing of one at its own address, or of a plant that is simulated faster than the clock."""
+    nodes = Nodes({"T": "T"}, {"u": "u"})
+
+    def told(endpoint: str, speed: float, *, running: bool) -> bool:
+        server = Server(endpoint, certificate=Path("c.der"), private_key=Path("k.pem"))
+        lines = doubts(Settings(PID, server, nodes, speed=speed), running=running)
+        return any("server_certificate" in line for line in lines)
+
+    away, here = "opc.tcp://10.1.2.3:4840", "opc.tcp://127.0.0.1:4840"
+    assert told(away, 1.0, running=True)
+    assert not told(here, 1.0, running=True)
+    assert not told(away, 10.0, running=True)
+    assert told(here, 1.0, running=False)

@@ -3,84 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 from chromium import CHROMIUM
-from identified_models import random_model
-from operated_page import TOKEN, ModelPlant, served
-from plant_servers import RunningLoop
-from predictive_loops import law_of
+from faceplate_steps import Steered, change, come_in, fact, value
 from processes import within
-
-from loopwright.pipeline.export.explain_graph import export_explanation
 
 if CHROMIUM is None:
     pytest.skip("no chromium is installed (Debian: apt install chromium-headless-shell)", allow_module_level=True)
 
-from playwright.sync_api import Browser, Locator, Page, expect
+from playwright.sync_api import Browser, Page, expect
 
-pytest_plugins = ["operated_laws", "browser_of_tests"]
-Steered = tuple[RunningLoop, ModelPlant]
-
-
-@pytest.fixture(scope="module")
-def steered(operated_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Steered]:
-    """The loop and its plant; beside the controller's file lies the graph that explains it."""
-    law = law_of(random_model(3, n_y=2, n_mv=2, n_dv=1), horizon=20, operate={})
-    export_explanation(law, operated_file)
-    made = served(operated_file, tmp_path_factory.mktemp("steered"))
-    yield made, ModelPlant.made
-    made.end()
-
-
-def come_in(browser: Browser, loop: RunningLoop, **how: Any) -> Page:
-    assert loop.station.page is not None
-    made = browser.new_page(**{"locale": "en-GB", "timezone_id": "UTC", **how})
-    made.goto(loop.station.page.url)
-    expect(made.locator('[data-operated="y0"]')).to_be_visible()
-    made.evaluate("token => sessionStorage.setItem('token', token)", TOKEN)
-    made.evaluate("sessionStorage.setItem('who', 'anna')")
-    return made
-
-
-@pytest.fixture
-def page(browser: Browser, steered: Steered) -> Iterator[Page]:
-    made = come_in(browser, steered[0], viewport={"width": 1500, "height": 1200})
-    raised: list[str] = []
-    made.on("pageerror", lambda error: raised.append(str(error)))
-    yield made
-    made.close()
-    assert raised == []
-
-
-def value(loop: RunningLoop, name: str) -> float:
-    """An entry of ``operate`` as the loop has it."""
-    assert loop.station.loop is not None
-    found: float = loop.station.loop.operate[loop.station.controller.manifest.operate.index(entry(loop, name))]
-    return found
-
-
-def entry(loop: RunningLoop, name: str) -> Any:
-    return next(e for e in loop.station.controller.manifest.operate if e.name == name)
-
-
-def fact(page: Page, signal: str, what: str) -> Locator:
-    return page.locator(f'[data-operated="{signal}"] [data-fact="{what}"]')
-
-
-def change(page: Page, signal: str, **values: str) -> None:
-    """By mouse, one request for all."""
-    page.click(f'[data-change="{signal}"]')
-    for what, text in values.items():
-        field = page.locator(f'[data-field="{signal}.{what}"]')
-        if field.evaluate("e => e.localName") == "select":
-            field.select_option(text)
-        else:
-            field.fill(text)
-    page.click("#confirm")
+pytest_plugins = ["faceplates_in_chromium"]
 
 
 def test_a_range_is_narrowed_in_one_request_and_drawn(page: Page, steered: Steered) -> None:
@@ -90,7 +25,7 @@ def test_a_range_is_narrowed_in_one_request_and_drawn(page: Page, steered: Steer
     expect(fact(page, "y1", "range")).to_have_text("-1.500 … 1.250 m")
     expect(fact(page, "y1", "rank")).to_have_text("1")
     assert [value(loop, f"y1.{what}") for what in ("low", "high", "rank", "track")] == [-1.5, 1.25, 1.0, 1.0]
-    asked = [line for line in loop.events() if line.startswith("change anna: operate ")]
+    asked = [line for line in loop.events() if line.startswith("change anna: y1: ")]
     assert len(asked) == 1  # what was not touched is not sent, and all at once is one change
     expect(page.locator('[data-chart="y1"]')).to_have_attribute("data-bands", "1")
     expect(page.locator('[data-chart="y0"]')).to_have_attribute("data-bands", "0")  # as wide as it was designed

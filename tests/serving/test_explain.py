@@ -20,6 +20,7 @@ from loopwright.serving.controller_file import controller_files
 from loopwright.serving.explain import Explainer, MovePart
 from loopwright.serving.explain.explain_file import explain_path
 from loopwright.serving.explain.explanation import sentence_of
+from loopwright.serving.operating import Operate
 
 pytest_plugins = ["operated_laws"]
 MODEL = random_model(3, n_y=2, n_mv=2, n_dv=1)  # of ``operated_file``
@@ -218,3 +219,38 @@ def test_shares_are_of_each_side_and_small_ones_are_not_named() -> None:
     assert "100 %: FIC-2" in text
     assert "TI-4" not in text
     assert sentence_of(0.0, 100.0, [MovePart("plan", "", 0.0)], {}) != text
+
+
+def test_a_resting_value_is_never_said_to_hold_back_what_goes_to_it() -> None:
+    """The plan may go to it in a roundabout way; the words then say so, of this MV alone."""
+    parts = [MovePart("setpoint", "LI-1", 5.0), MovePart("rest", "FV-3", -2.0)]
+    towards, away = (sentence_of(3.0, 100.0, parts, {}, {"FV-3": far}) for far in (-20.0, 20.0))
+    another = sentence_of(3.0, 100.0, parts, {})
+    assert towards == another != away
+    assert "FV-3" in away
+
+
+def test_a_side_that_hardly_counts_is_not_named() -> None:
+    parts = [MovePart("setpoint", "LI-1", 24.0), MovePart("rest", "FV-3", -0.08)]
+    assert "FV-3" not in sentence_of(23.9, 100.0, parts, {})
+    assert "FV-3" in sentence_of(22.0, 100.0, [parts[0], MovePart("rest", "FV-3", -2.0)], {})
+
+
+def test_the_words_of_a_rest_follow_its_way(explainer: Explainer) -> None:
+    """Of every explained step: the part of an MV's own rest is said plainly only where it points to the rest."""
+    inputs, _ = at_rest(explainer, 20)
+    operate = Operate(explainer.manifest.operate)
+    plain, about = set[bool](), 0
+    for rest in np.linspace(-0.9, 0.9, 13):
+        for sp in (0.0, 0.4, -0.4):
+            values = operate.with_values({"u0.rest": rest, "u0.rest_use": 1})
+            found = explainer.explain(**{**inputs, "sp": inputs["sp"] + sp, "operate": values}).move("u0")
+            part = next((p for p in found.parts if p.cause == "rest"), None)
+            if part is None or "u0 to its resting value" not in found.sentence:
+                continue
+            about += 1
+            towards = part.value * (rest - inputs["mv_applied"][0]) > 0
+            assert ("u0 to its resting value, first" in found.sentence) is not towards
+            plain.add(towards)
+    assert about
+    assert True in plain

@@ -115,10 +115,10 @@ def test_a_restart_says_what_operators_had_set_and_takes_it_back_where_it_is_tol
     running.does("sp", {"p": 6.0})
     running.end()
     again = RunningLoop(settings)
-    assert within(20, lambda: any("the last loop ended" in line for line in again.events()))
-    said = [line for line in again.events() if "the last loop ended with other values" in line]
+    assert within(20, lambda: any("the last one ended" in line for line in again.events()))
+    said = [line for line in again.events() if "the last one ended" in line]
     assert len(said) == 1
-    assert all(word in said[0] for word in ("valve.high 77", "T.use 0", "p 6"))
+    assert all(word in said[0] for word in ("valve: high limit 77", "T back", "p 6"))
     assert again.station.loop is not None
     assert again.station.loop.wishes == {}
     again.does("operate", {"valve.high": 66.0})
@@ -128,5 +128,5 @@ def test_a_restart_says_what_operators_had_set_and_takes_it_back_where_it_is_tol
     assert third.station.loop is not None
     assert third.station.loop.wishes == {"valve.high": 66.0}
     assert third.station.loop.sp.tolist() == [300.0, 7.0]
-    assert within(20, lambda: any("restored" in line and "valve.high 66" in line for line in third.events()))
+    assert within(20, lambda: any("restored" in line and "-> 66 %" in line for line in third.events()))
     third.end()

@@ -98,6 +98,51 @@ def test_its_way_by_hand_ends_where_the_law_takes_it_again(slow_mvs: Controller,
     assert loop.mv_wanted[1] == loop.mv[1]
 
 
+@pytest.mark.parametrize("stands", [40.0, 55.0], ids=["as commanded", "elsewhere"])
+def test_an_mv_is_taken_in_hand_and_sent_to_a_value_at_once(operated: Controller, stands: float) -> None:
+    """Also one that is read back far off its command, which stays there when it is taken in hand alone."""
+    loop = loop_of(operated)
+    loop.scan(sample(t=290.0, valve=float(loop.mv[0])))
+    others = loop.operate
+    loop.set_mv([62.0, loop.mv[1]], take=["valve"])
+    assert np.count_nonzero(loop.operate != others) == 1
+    command = loop.scan(sample(t=290.0, valve=stands))
+    assert (command.mv[0], command.mode) == (62.0, Mode.AUTO)
+    later = loop.scan(sample(t=290.0, valve=62.0))
+    assert later.mv[0] == 62.0
+    assert later.law_mv is not None
+    assert later.law_mv[0] == 62.0  # the law has learnt it
+    loop.set_operate({"valve.use": 1.0})
+    assert loop.scan(sample(t=300.0, valve=62.0)).mode is Mode.AUTO
+
+
+def test_an_mv_that_is_taken_in_hand_goes_no_faster_and_comes_back_without_a_bump(
+    slow_mvs: Controller, predictive_model: Any
+) -> None:
+    loose = {"y0.track": 0.0, "y1.track": 0.0}
+    plant, loop = ActuatedPlant(predictive_model), steered(slow_mvs, operate=loose)
+    run(loop, plant, 20)
+    begun = float(loop.mv[1])
+    loop.set_mv([loop.mv[0], begun + 0.25], take=["u1"])
+    moves = [float(c.mv[1]) - begun for c in run(loop, plant, 4)]
+    assert moves == pytest.approx([0.1, 0.2, 0.25, 0.25])
+    loop.set_operate({"u1.use": 1.0})
+    assert [float(c.mv[1]) - begun for c in run(loop, plant, 3)] == pytest.approx([0.25] * 3)
+
+
+def test_what_cannot_be_taken_in_hand_is_refused_and_nothing_is_changed(operated: Controller) -> None:
+    loop = loop_of(operated)
+    loop.scan(sample())
+    before = loop.operate.tolist(), loop.mv.tolist()
+    for values, take in (([140.0, 0.5], "valve"), ([40.0, 0.6], "heat")):  # out of range; one that this law needs
+        with pytest.raises(LoopError, match=take):
+            loop.set_mv(values, take=[take])
+    loop.set_mode(Mode.SHADOW)
+    with pytest.raises(LoopError, match="SHADOW"):
+        loop.set_mv([41.0, 0.5], take=["valve"])
+    assert (loop.operate.tolist(), loop.mv.tolist()) == before
+
+
 @pytest.mark.parametrize("moved", [0.0, 0.013, -0.031, 0.3], ids=str)
 def test_in_hand_and_back_at_rest_is_no_bump(slow_mvs: Controller, predictive_model: Any, moved: float) -> None:
     """Nothing is tracked, so that no optimum asks for a move; an actuator is read back a little off its command."""

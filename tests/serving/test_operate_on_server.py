@@ -54,15 +54,15 @@ def test_one_sensor_stops_no_loop_and_nodes_move_limits(
     assert within(20, lambda: running.commands[-1].mv[0] == 100.0)
     nodes.write("high", 70.0)
     assert within(20, lambda: running.commands[-1].mv[0] == 70.0)
-    assert running.does("operate", {"valve.high": 60.0}).startswith("operate valve.high 70 -> 60")
+    assert running.does("operate", {"valve.high": 60.0}).startswith("valve: high limit 70 -> 60 %")
     assert within(20, lambda: running.commands[-1].mv[0] == 60.0)
     nodes.write("use", False)  # the plant's own switch: the MV is in local
-    assert within(20, lambda: "change plant: operate valve.use 0" in running.events())
+    assert within(20, lambda: "change plant: valve taken out" in running.events())
     before = len(running.commands)
     assert within(20, lambda: len(running.commands) > before + 2)
     assert running.commands[-1].mv[0] == 60.0
     nodes.write("high", 120.0)
-    assert within(20, lambda: any("refused: operate valve.high 120" in line for line in running.events()))
+    assert within(20, lambda: any("refused: valve: high limit 60 -> 120" in line for line in running.events()))
     running.end()
 
 

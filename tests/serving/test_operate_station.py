@@ -113,7 +113,7 @@ def test_nodes_of_operate_are_read_and_named(operated: Controller) -> None:
 
 def settings_of(controller: Controller, **changed: Any) -> Settings:
     nodes = Nodes(**changed.pop("nodes", NODES))
-    return Settings(controller.path, SERVER, nodes, start="MANUAL", **changed)
+    return Settings(controller.path, SERVER, nodes, **{"start": "MANUAL", **changed})
 
 
 # ------------------------------------------------------------------------------------------------------------ settings
@@ -223,10 +223,10 @@ def ran(made: Station, **at: Callable[[Any], None]) -> tuple[list[Command], list
         return commands, [f"{e.kind} {e.who}: {e.what} ({e.reason})" for _, e in reader.events()]
 
 
-def asked(made: Station, value: Any) -> Callable[[Any], None]:
+def asked(made: Station, value: Any, do: str = "operate") -> Callable[[Any], None]:
     def act(_: Any) -> None:
         assert made.loop is not None
-        request = Request.read({"do": "operate", "value": value, "who": "anna", "reason": "valve sticks"})
+        request = Request.read({"do": do, "value": value, "who": "anna", "reason": "valve sticks"})
         made.ask(change(request, made.loop, lambda file, sha256: Controller(file)))
 
     return act
@@ -237,11 +237,35 @@ def test_a_request_is_carried_out_written_down_and_shown(
 ) -> None:
     made = make_station(operated, operate={"speed": 2.0})
     _, events = ran(made, s2=asked(made, {"valve.high": 60, "T.use": 0}))
-    assert "change anna: operate T.use 1 -> 0, valve.high 100 -> 60 % (valve sticks)" in events
+    assert "change anna: T taken out; valve: high limit 100 -> 60 % (valve sticks)" in events
     names = [row["name"] for row in about(made)["operate"]]
     shown = dict(zip(names, state(made)["operate"], strict=True))
     assert (shown["valve.high"], shown["T.use"], shown["speed"]) == (60.0, 0.0, 2.0)
     json.dumps([about(made), state(made)], allow_nan=False)
+
+
+def test_an_mv_is_taken_in_hand_and_sent_in_one_change(
+    operated: Controller, make_station: Callable[..., Station]
+) -> None:
+    made = make_station(operated, start="AUTO", accept_unproven=True)
+    commands, events = ran(made, s2=asked(made, {"valve": 71.0}, "by_hand"))
+    said = [line for line in events if line.startswith("change anna")]
+    assert len(said) == 1
+    assert "valve taken out" in said[0]
+    assert "71 %" in said[0]
+    assert [float(c.mv[0]) for c in commands[3:]] == [71.0] * len(commands[3:])
+    assert commands[-1].mode is Mode.AUTO
+    shown = dict(zip([row["name"] for row in about(made)["operate"]], state(made)["operate"], strict=True))
+    assert (shown["valve.use"], state(made)["goal"][0]) == (0.0, 71.0)
+
+
+@pytest.mark.parametrize("value", [{"valve": 140.0}, {"heat": 0.5}, {"vlave": 1.0}, {"valve": "much"}, None], ids=str)
+def test_an_mv_that_cannot_be_taken_or_sent_is_refused(operated: Controller, value: Any) -> None:
+    loop = control_loop(settings_of(operated, start="AUTO", accept_unproven=True), operated, mv=[40.0, 0.5])
+    request = Request.read({"do": "by_hand", "value": value, "who": "anna"})
+    with pytest.raises(LoopError) as error:
+        change(request, loop, lambda file, sha256: Controller(file))
+    assert error.value.entry == ("valve" if value == {"valve": 140.0} else "")
 
 
 @pytest.mark.parametrize("value", [{"valve.hihg": 1.0}, {"valve.high": 1000.0}, {"T.use": 0.5}, {}, None, 5.0], ids=str)
@@ -270,7 +294,7 @@ def test_a_request_that_another_one_has_made_impossible_is_refused_in_the_journa
         asked(made, {"valve.low": 50.0})(plant)
 
     _, events = ran(made, s2=both)
-    assert any("refused: operate valve.low 0 -> 50 %" in line for line in events)
+    assert any("refused: valve: low limit 0 -> 50 %" in line for line in events)
 
 
 def test_the_plants_own_operator_steers_by_nodes(operated: Controller, make_station: Callable[..., Station]) -> None:
@@ -285,10 +309,10 @@ def test_the_plants_own_operator_steers_by_nodes(operated: Controller, make_stat
     made.endpoint.asked = {"valve.low": 10.0, "valve.high": 60.0, "T.use": 1.0}  # type: ignore[attr-defined]
     _, events = ran(made, s3=both_ends, s6=one_wrong)
     said = [line for line in events if line.startswith("change plant")]
-    assert said[0] == "change plant: operate valve.low 10 %, valve.high 60 %, T.use 1 ()"  # as it stood at first
-    assert said[1] == "change plant: operate valve.low 70 %, valve.high 90 % ()"
-    assert said[2].startswith("change plant: refused: operate valve.low 95 %")
-    assert said[3] == "change plant: operate T.use 0 ()"
+    assert said[0] == "change plant: valve: low limit 0 -> 10 %, high limit 100 -> 60 % ()"  # as it stood at first
+    assert said[1] == "change plant: valve: low limit 10 -> 70 %, high limit 60 -> 90 % ()"
+    assert said[2].startswith("change plant: refused: valve: low limit 70 -> 95 %")
+    assert said[3] == "change plant: T taken out ()"
     assert len(said) == 4
     assert made.loop is not None
     assert made.loop.operate[[0, 5, 6]].tolist() == [0.0, 70.0, 90.0]

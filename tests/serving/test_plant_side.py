@@ -91,7 +91,7 @@ def test_a_range_that_moves_end_by_end_gets_there(operated: Controller) -> None:
     (refused,) = operator.write(T_low=300.0)
     assert refused.startswith("refused")
     assert operator.write() == []
-    assert operator.write(T_high=320.0) == ["operate T.low 300 K, T.high 320 K"]
+    assert operator.write(T_high=320.0) == ["T: low limit 260 -> 300 K, high limit 280 -> 320 K"]
     assert (named(loop)["T.low"], named(loop)["T.high"]) == (300.0, 320.0)
     assert operator.write() == []
 
@@ -105,7 +105,7 @@ def test_a_wrong_value_takes_only_itself_with_it(operated: Controller) -> None:
     found = named(loop)
     assert (found["T.low"], found["T.high"], found["valve.high"], found["speed"]) == (300.0, 320.0, 60.0, 1.0)
     (once,) = operator.write(valve_high=70.0)  # and nothing again of the others
-    assert once == "operate valve.high 70 %"
+    assert once == "valve: high limit 60 -> 70 %"
     assert len(operator.write(speed=8.0)) == 1
 
 
@@ -150,7 +150,7 @@ def test_a_contact_that_fell_while_the_server_started_anew_counts(operated: Cont
     operator.starts = 1
     (told, taken) = operator.write(valve_use=0.0, speed=1.0)
     assert "operate" in told
-    assert taken == "operate valve.use 0"
+    assert taken == "valve taken out"
     assert (named(loop)["valve.use"], named(loop)["speed"]) == (0.0, 2.0)
 
 

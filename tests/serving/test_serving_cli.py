@@ -13,6 +13,7 @@ import pytest
 from loopwright.pipeline.export.controller_file import with_evidence
 from loopwright.serving import ArtifactError, Controller, Manifest
 from loopwright.serving.__main__ import main
+from loopwright.serving.operating import unit_words
 from loopwright.serving.station import command
 from loopwright.serving.station.settings import template
 from loopwright.serving.words import harmless, plain
@@ -46,7 +47,8 @@ def test_the_card_says_what_operators_may_change(operated_file: Path, pi_file: P
     for e in Controller(operated_file).manifest.operate:
         switch = e.what in {"use", "track", "rest_use"}
         allowed = ["0", "or", "1"] if switch else [f"{e.low:g}", "..", f"{e.high:g}"]
-        assert [e.name, f"{e.default:g}", *allowed, *([e.unit] if e.unit else [])] in rows
+        unit = unit_words(e, Controller(operated_file).manifest.period_s)
+        assert [e.name, f"{e.default:g}", *allowed, *unit.split()] in rows
     assert main(["inspect", str(operated_file), "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["operate"]) == len(Controller(operated_file).manifest.operate)
     assert main(["inspect", str(pi_file)]) == 0

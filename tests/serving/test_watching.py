@@ -105,7 +105,7 @@ def station_that(did: list[str], write: Callable[..., object]) -> Station:
     monitor = Monitor(controller.manifest, started_s=1e9)
     return cast(Station, SimpleNamespace(
         loop=SimpleNamespace(
-            controller=controller, successor=None, replaced=None, operate=(), stepped=None, wishes={},
+            controller=controller, successor=None, replaced=None, operate=(), stepped=None, wishes={}, mv_wanted=(),
             sp=np.zeros(len(controller.manifest.sp)), manifest=controller.manifest,
             courses=SimpleNamespace(ends={}, finished=(), now_s=0.0, standing={}),
         ),

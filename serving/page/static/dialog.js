@@ -8,7 +8,7 @@ const SETTLE_MS = 400; // after the last key
 let looking = 0; // the timer of a look at what would be
 let pending = null; // what is asked for now; an answer to an earlier one does not touch this one
 
-// title, words: what will change; fields: [{name, label, value, now, unit, min, max, choices}]; request(values): what is
+// title, words: what will change; fields: [{name, label, said, value, now, unit, min, max, choices}]; request(values): what is
 // sent. A field with `now` is sent only where the operator changed it, so that rounding moves nothing. foresee(values):
 // an element that shows what the values would do, or null. In place of fields a `body` may be asked in, an element of which
 // `said()` tells in a line what is given, and `request()` makes what is sent; it throws an error with `entry` where it cannot.
@@ -60,7 +60,7 @@ function moves() {
     .filter(([given]) => given.now !== undefined)
     .map(([given, input]) => {
       const to = input.selectedOptions ? input.selectedOptions[0].textContent : input.value;
-      return `${given.name} ${given.now || "–"} → ${to || "…"} ${given.unit}`.trim();
+      return `${given.said ? `${given.said}:` : given.name} ${given.now || "–"} → ${to || "…"} ${given.unit}`.trim();
     });
   say($("dialog-moves"), said.join(", "));
 }

@@ -38,9 +38,21 @@ export function show(found) {
   for (const button of $("modes").children) button.setAttribute("aria-pressed", button.dataset.mode === state.mode);
   $("change-sp").disabled = !about; // without the signals a click would do nothing
   $("change-mv").disabled = !about || state.mode !== "MANUAL";
-  $("change-mv").title = state.mode === "MANUAL" ? "" : "in MANUAL only";
+  $("change-mv").title = state.mode === "MANUAL" ? "" : "all of them in MANUAL only; a single one at its own faceplate";
+  $("legend").hidden = !about;
   if (about && state.pv !== undefined) values();
+  if (about) leftOut();
   trial();
+}
+
+// The signals that the law does not have, above the alarms: also those that somebody took out, which is no alarm.
+function leftOut() {
+  const found = operate.leftOut(state, about.signals);
+  const text = JSON.stringify(found);
+  if ($("left-out").dataset.of === text) return;
+  $("left-out").dataset.of = text;
+  $("left-out").hidden = !found.length;
+  $("left-out").replaceChildren(...found.map(({ name, words }) => element("li", { "data-out": name }, element("strong", {}, name), ` ${words}`)));
 }
 
 // A block a signal: its values side by side, and a bar of its range. It is laid out once, and then filled.
@@ -79,6 +91,7 @@ function values() {
     const operated = made.querySelector(".operated");
     if (!operated) return;
     operate.fill(operated, group, s, state, i);
+    operate.fillHand(made, s, state);
     within(made.querySelector(".within"), s, operate.range(s));
   });
   const whole = $("values").querySelector('[data-operated="law"]');
@@ -90,7 +103,8 @@ const lawBlock = (part) => element("div", { class: "signal", role: "group", "ari
 // The name of a block, and the button that changes what operators may change of it.
 function headed(name, group, signal) {
   const button = element("button", { type: "button", "data-change": signal ? name : "law", "aria-label": `Change ${name}…`, onclick: () => operate.askChange(group, signal) }, "Change…");
-  return element("div", { class: "headed" }, element("h3", {}, name), button);
+  const buttons = element("div", { class: "buttons" }, ...operate.handButtons(group, signal), button);
+  return element("div", { class: "headed" }, element("h3", {}, name), buttons);
 }
 
 // The part of the bar that operators allow.
