@@ -88,10 +88,14 @@ def _signals(big: str, kind: str, signals: Sequence[Signal]) -> str:
     return "\n".join(lines)
 
 
+def places_above(m: Manifest) -> list[int]:
+    """By entry of ``operate``: the place of the high end that a low end must not exceed, of any other its own."""
+    names = [e.name for e in m.operate]
+    return [names.index(f"{e.signal}.high") if e.what == "low" else i for i, e in enumerate(m.operate)]
+
+
 def _operate(big: str, m: Manifest) -> str:
     """Entries of ``operate``, in their order."""
-    names = [e.name for e in m.operate]
-    above = [names.index(f"{e.signal}.high") if e.what == "low" else i for i, e in enumerate(m.operate)]
     uses = {e.signal: i for i, e in enumerate(m.operate) if e.group == "cv" and e.what == "use"}
     use = [uses.get(s.name, -1) for s in m.pv]
     words = "\n".join(f"   [{i}] {_words(e.name)} {_words(e.unit)}".rstrip() for i, e in enumerate(m.operate))
@@ -103,7 +107,7 @@ def _operate(big: str, m: Manifest) -> str:
             _numbers(f"{big}_OPERATE_HIGH", [e.high for e in m.operate]),
             "/* 0 or 1 alone; the entry that it must not exceed, or itself; where the use of a PV stands, or -1 */",
             _integers(f"{big}_OPERATE_SWITCH", [int(e.what in SWITCHES) for e in m.operate]),
-            _integers(f"{big}_OPERATE_ABOVE", above),
+            _integers(f"{big}_OPERATE_ABOVE", places_above(m)),
             _integers(f"{big}_USE_OF_PV", use),
         ]
     )
