@@ -54,7 +54,7 @@ def c_folder(controller: Controller, name: str) -> dict[str, str]:
     call = ", ".join(IN_GUARD[n] for n in arguments_of(program))
     guards = {f"{name}_guard.{end}": _of_template(f"guard.{end}", name, head, call) for end in ("h", "c")}
     return {
-        f"{name}.h": printed_header(head, m, controller.sha256, name, step),
+        f"{name}.h": printed_header(head, m, controller.sha256, name, step, arguments_of(program)),
         f"{name}.c": _source(head, name, step),
         **guards,
         f"{name}_selftest.c": printed_self_test(head, name, program, kit_in_c(controller, program)),

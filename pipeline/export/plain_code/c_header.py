@@ -6,11 +6,17 @@ from collections.abc import Sequence
 
 from loopwright.pipeline.export.plain_code.c_text import PrintedStep
 from loopwright.pipeline.export.plain_code.printed_functions import number
-from loopwright.serving.manifest import SWITCHES, Manifest, Signal
+from loopwright.serving.manifest import INPUTS, SWITCHES, Manifest, Signal
+
+OUTPUTS = ("mv", "state_next", "info")
 
 
-def printed_header(head: str, m: Manifest, sha256: str, name: str, step: PrintedStep) -> str:
-    """``NAME.h``: sizes, ranges, entries of ``operate``, what a step takes, and its declaration; C99 and C++17."""
+def printed_header(head: str, m: Manifest, sha256: str, name: str, step: PrintedStep, arguments: Sequence[str]) -> str:
+    """``NAME.h``: sizes, ranges, entries of ``operate``, what a step takes, and its declaration; C99 and C++17.
+
+    ``arguments`` are the names of what a step is given and gives, in its order.
+    """
+    by_place = [f"(in)[{INPUTS.index(n)}]" if n in INPUTS else f"(out)[{OUTPUTS.index(n)}]" for n in arguments]
     big = name.upper()
     n_ahead = 0 if m.ahead is None else m.ahead.size
     sizes = {n: len(getattr(m, n)) for n in ("sp", "pv", "dv", "mv", "info", "operate")}
@@ -56,6 +62,11 @@ def printed_header(head: str, m: Manifest, sha256: str, name: str, step: Printed
         *tables,
         "",
         f"{step.declaration};",
+        "",
+        "/* The same for a host of any law: in has sp, pv, dv, mv_applied, state, operate, fresh, ahead, out has mv,",
+        "   state_next, info; READS names those of in that this law reads. */",
+        f"#define {big}_CALL(in, out) {name}_step({', '.join(by_place)})",
+        f'#define {big}_READS "{" ".join(n for n in arguments if n in INPUTS)}"',
         "",
         "#ifdef __cplusplus",
         "}",

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import onnx
 
-from loopwright.pipeline.export.plain_code.c_files import arguments_of, c_folder
+from loopwright.pipeline.export.plain_code.c_files import c_folder
 from loopwright.pipeline.export.plain_code.c_header import places_above
 from loopwright.pipeline.export.plain_code.interpreter import run
 from loopwright.pipeline.export.plain_code.lowering import lowered
@@ -19,9 +19,6 @@ from loopwright.serving.controller import Controller, Step
 from loopwright.serving.manifest import INPUTS, SWITCHES, Manifest, Signal
 
 LAW = "law"  # the name of the step in C, of every FMU: its library shows the functions of FMI alone
-# What stands in C for what a step is given and gives, in the order of the arrays of controller.c.
-OF_INPUT = dict(zip(INPUTS, ("SP", "PV", "DV", "MV", "STATE", "OPERATE", "FRESH", "AHEAD"), strict=True))
-OF_OUTPUT = dict(zip(OUTPUTS, ("OUT_MV", "OUT_STATE", "OUT_INFO"), strict=True))
 
 
 def sources_of(controller: Controller, fmi: int, tools: Toolchain) -> dict[str, str]:
@@ -53,17 +50,11 @@ def plain_answers(controller: Controller) -> list[StepResult]:
 
 
 def _signals(controller: Controller) -> str:
-    """``law_signals.h``: names, units and ranges as ``controller.c`` takes them, and the call of a step."""
+    """``law_signals.h``: names, units and ranges as ``controller.c`` takes them."""
     m = controller.manifest
     uses = ", ".join(str(name in m.inputs).lower() for name in INPUTS)
-    call = ", ".join(
-        f"(in)[{OF_INPUT[n]}]" if n in OF_INPUT else f"(out)[{OF_OUTPUT[n]}]"
-        for n in arguments_of(lowered(onnx.load(controller.path)))
-    )
     lines = [
         f"/* Names, units and ranges of the law whose sha256 is {controller.sha256}. */",
-        f"#define LAW_CALL(in, out) {LAW}_step({call})",
-        "",
         f"static const bool LAW_USES[INPUTS] = {{{uses}}};",
         "",
     ]
