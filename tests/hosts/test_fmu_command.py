@@ -132,7 +132,7 @@ def test_the_page_names_every_option_and_variable() -> None:
     options(parser)
     names = {name for action in parser._actions for name in action.option_strings} - {"-h", "--help"}
     assert names == {"--out", "--fmi", "--onnxruntime"}
-    assert all(f"{name} " in page for name in names)
+    assert all(f"{name} " in page or f"`{name}`" in page for name in names)
     groups = {row.group for row in variables_of(Controller(PID).manifest)} - {"time"}
     assert groups == {"sp", "pv", "mv_applied", "mv_start", "mv", "info", "fault", "use_mv_applied"}
     assert all(f"`{group}" in page for group in (*groups, "dv."))

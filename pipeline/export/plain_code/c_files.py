@@ -64,7 +64,7 @@ def c_folder(controller: Controller, name: str) -> dict[str, str]:
 
 
 def arguments_of(program: PlainProgram) -> list[str]:
-    """What a step in C is given and gives, in its order: names of inputs, then mv, state_next and info."""
+    """The names of what a step in C is given and gives, in its order: inputs, then mv, state_next and info."""
     return [*program.inputs, *(n.removeprefix(OUTPUT) for n, count in program.outputs.items() if count)]
 
 

@@ -1,7 +1,7 @@
 /* A controller in a host: its signals and ranges, what it may be given, and what may be taken of a step.
 
-   What computes the law is not in here. Whoever includes this file defines `run_graph`, which computes c->out from c->in,
-   and makes and frees a Controller: host.c with onnxruntime, an FMU with the plain C of one controller. */
+   The law itself is not in here. A file that includes this one defines `run_graph`, which computes c->out from c->in, and
+   makes and frees a Controller: host.c with onnxruntime, an FMU with the plain C of one controller. */
 
 #include <math.h>
 #include <stdarg.h>
