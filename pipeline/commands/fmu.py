@@ -7,12 +7,12 @@ import os
 import tempfile
 from pathlib import Path
 
-from loopwright.pipeline.errors import HostError
+from loopwright.pipeline.errors import ExportError, HostError
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.hosts.fmu.compiling import toolchain
 from loopwright.pipeline.hosts.fmu.folder import check, pack, problems, write_folder
 from loopwright.pipeline.hosts.fmu.law_sources import plain_answers
-from loopwright.serving.conformance.steps import answered
+from loopwright.serving.conformance.steps import StepResult, answered
 from loopwright.serving.controller import Controller
 
 KILOBYTE = 1e3  # bytes
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     out: Path = Path(f"{options.file.stem}.fmu") if options.out is None else options.out
     _require_free(out)
     tools = toolchain(onnxruntime=options.onnxruntime)
-    plain = None if options.onnxruntime else plain_answers(controller)
+    plain = None if options.onnxruntime else _plain_answers(controller)
     with draft_of(out) as draft, tempfile.TemporaryDirectory(prefix="loopwright-fmu-") as made:
         folder = Path(made)
         write_folder(controller, folder, options.fmi, tools)
@@ -48,6 +48,13 @@ def run(options: argparse.Namespace) -> None:
         steps = check(controller, draft, folder, answered(controller) if plain is None else plain)
     size, of = out.stat().st_size / KILOBYTE, "controller file" if plain is None else "plain C's statements"
     print(f"{out}: FMI {options.fmi}.0, {size:.0f} kB, {steps} steps give the same bits as the {of}")
+
+
+def _plain_answers(controller: Controller) -> list[StepResult]:
+    try:
+        return plain_answers(controller)
+    except ExportError as error:
+        raise HostError(f"{error}; with --onnxruntime an FMU needs no plain C") from error
 
 
 def _require_free(out: Path) -> None:

@@ -44,15 +44,16 @@ def test_the_example_closes_a_loop_once_a_period(tmp_path: Path) -> None:
     (mv,) = Controller(PID).manifest.mv
     moved = [float(row[5]) for row in rows]
     assert all(mv.low <= value <= mv.high for value in moved)
-    assert len(set(moved)) > 2
+    assert len(set(moved)) > 1
 
 
 def test_the_example_takes_a_law_with_disturbances_and_operators(tmp_path: Path) -> None:
     model = random_model(5, n_y=2, n_mv=3, n_dv=1)
     export(law_of(model, horizon=15, operate={}), tmp_path / "law.onnx", case="made", provenance={})
-    done = run(built(tmp_path / "law.onnx", tmp_path), "30", "0.001")
+    done = run(built(tmp_path / "law.onnx", tmp_path), "30", "0.02")
     assert done.returncode == 0, done.stderr
     signals = Controller(tmp_path / "law.onnx").manifest.mv
+    assert done.stdout
     for row in (line.split() for line in done.stdout.splitlines()):
         assert all(s.low <= float(v) <= s.high for s, v in zip(signals, row[5:], strict=True))
 
@@ -67,7 +68,7 @@ def test_the_example_writes_nothing_before_it_has_read_the_plant(tmp_path: Path)
         assert text.count(place) == 1
         text = text.replace(place, place + more)
     (tmp_path / "changed.c").write_text(text)
-    first, second, third, *_ = run(built(PID, tmp_path, tmp_path / "changed.c"), "60", "0.001").stdout.splitlines()
+    first, second, third, *_ = run(built(PID, tmp_path, tmp_path / "changed.c"), "60", "0.02").stdout.splitlines()
     assert first.endswith("HOLD fault 1 at 0")
     assert second.endswith("HOLD fault 1 at 0")
     assert third == "written 250"  # the read-back: where the made-up plant's actuator stands

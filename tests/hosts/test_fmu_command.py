@@ -16,6 +16,7 @@ from kits import ROOT
 from loopwright.pipeline.__main__ import main
 from loopwright.pipeline.commands import OneLineParser
 from loopwright.pipeline.commands.fmu import options
+from loopwright.pipeline.export.plain_code import lowering
 from loopwright.pipeline.hosts.fmu.compiling import HEADER, HOSTS, SHIPPED, SHIPPED_SHA256, SOURCES
 from loopwright.pipeline.hosts.fmu.variables import variables_of
 from loopwright.serving import Controller
@@ -64,6 +65,19 @@ def test_the_command_can_put_onnxruntime_into_the_fmu(tmp_path: Path, capsys: Ca
     assert capsys.readouterr().out.endswith(" steps give the same bits as the controller file\n")
     with zipfile.ZipFile(tmp_path / "x.fmu") as made:
         assert made.read("resources/controller.onnx") == PID.read_bytes()
+
+
+def test_a_law_without_plain_c_is_pointed_to_onnxruntime(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    """As of an operator that no statement stands for."""
+    known = {name: row for name, row in lowering.ONE_OF_TWO.items() if name != "Mul"}
+    monkeypatch.setattr(lowering, "ONE_OF_TWO", known)
+    told = refused(capsys, PID, "--out", tmp_path / "x.fmu")
+    assert "operator Mul" in told
+    assert "--onnxruntime" in told
+    assert not list(tmp_path.iterdir())
+    assert main(["fmu", str(PID), "--onnxruntime", "--out", str(tmp_path / "x.fmu")]) == 0
 
 
 def test_a_file_that_is_no_controller_is_refused(tmp_path: Path, capsys: Capture) -> None:
