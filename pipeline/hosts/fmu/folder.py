@@ -103,7 +103,8 @@ def build_description(identifier: str, tools: Toolchain) -> bytes:
     root = Element("fmiBuildDescription", fmiVersion="3.0")
     words = PLAIN_WORDS if plain else HOST_WORDS
     build = SubElement(root, "BuildConfiguration", modelIdentifier=identifier, description=words)
-    files = SubElement(build, "SourceFileSet", language="C11")
+    options = {"compiler": "gcc", "compilerOptions": "-ffp-contract=off"}
+    files = SubElement(build, "SourceFileSet", {"language": "C11"} | (options if plain else {}))
     for name in compiled(fmi, tools):
         SubElement(files, "SourceFile", name=name)
     if not plain:
