@@ -77,8 +77,8 @@ def python_host(folder: Path) -> Iterator[tuple[Run, int]]:
 
 @contextmanager
 def c_host(folder: Path) -> Iterator[tuple[Run, int]]:
-    """examples/embed/c, built for speed."""
-    call("cmake", "-S", EMBED / "c", "-B", folder / "c", f"-DONNXRUNTIME_DIR={ONNXRUNTIME}")
+    """examples/embed/c/onnxruntime, built for speed."""
+    call("cmake", "-S", EMBED / "c" / "onnxruntime", "-B", folder / "c", f"-DONNXRUNTIME_DIR={ONNXRUNTIME}")
     call("cmake", "--build", folder / "c")
     host = folder / "c" / "host"
     yield (

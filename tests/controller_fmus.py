@@ -10,14 +10,20 @@ from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
+import onnx
 from kits import SHIPPED
 from numpy.typing import NDArray
 
+from loopwright.pipeline.export.plain_code.interpreter import run
+from loopwright.pipeline.export.plain_code.lowering import lowered
+from loopwright.pipeline.export.plain_code.statements import OUTPUT
 from loopwright.pipeline.hosts.fmu.compiling import Toolchain, toolchain
 from loopwright.pipeline.hosts.fmu.folder import write_folder
+from loopwright.pipeline.hosts.fmu.law_sources import plain_answers
 from loopwright.pipeline.plants.fmu.instance import NAMES
 from loopwright.serving import Controller
-from loopwright.serving.conformance.steps import StepResult, answered
+from loopwright.serving.conformance.steps import OUTPUTS, StepResult, answered
+from loopwright.serving.controller import Step
 
 Array = NDArray[np.float64]
 BOOLEAN = {"fault", "use_mv_applied", "use_fresh"}
@@ -36,24 +42,38 @@ def controller_of(name: str) -> Controller:
 
 
 @cache
-def answers_of(name: str) -> list[StepResult]:
-    """The kit's steps with Python's answers."""
-    return answered(controller_of(name))
+def answers_of(name: str, *, onnxruntime: bool = False) -> list[StepResult]:
+    """The kit's steps, answered as an FMU must: by the statements of its plain C, or by onnxruntime."""
+    return answered(controller_of(name)) if onnxruntime else plain_answers(controller_of(name))
 
 
 @cache
-def tools() -> Toolchain:
-    """This machine's compiler, headers and library."""
-    return toolchain()
+def tools(*, onnxruntime: bool = False) -> Toolchain:
+    """This machine's compiler and headers, for an FMU of plain C or with onnxruntime's library."""
+    return toolchain(onnxruntime=onnxruntime)
 
 
 @cache
-def unpacked(name: str, fmi: int) -> Path:
+def unpacked(name: str, fmi: int, *, onnxruntime: bool = False) -> Path:
     """The folder of an FMU, written once a process and removed at its end."""
     folder = Path(mkdtemp(prefix="controller-fmu-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    write_folder(controller_of(name), folder, fmi, tools())
+    write_folder(controller_of(name), folder, fmi, tools(onnxruntime=onnxruntime))
     return folder
+
+
+class PlainSteps:
+    """A controller stepped by the statements of its plain C, run in Python."""
+
+    def __init__(self, controller: Controller) -> None:
+        self.controller, self.program = controller, lowered(onnx.load(controller.path))
+
+    def step(self, **given: Any) -> Step:
+        """One step: inputs as of ``Controller.step``; ``operate``, ``fresh`` and ``ahead`` have their usual values."""
+        usual = self.controller.manifest.usual
+        taken = {n: np.ravel(given[n] if n in given else usual(n)) for n in self.program.inputs}
+        found = run(self.program, **taken)
+        return Step(*(found.get(f"{OUTPUT}{name}", np.zeros(0)) for name in OUTPUTS))
 
 
 class Unit:

@@ -34,7 +34,7 @@ KEEP_TIME = (
     *("test_playground_of_a_made_plant_in_browser.py", "test_signed_steering.py", "test_quality.py"),
     *("test_watching.py", "test_starting.py", "test_operate_on_server.py"),
     *("test_page_faceplates_in_browser.py", "test_faceplates.py", "test_page_courses_in_browser.py"),
-    "test_page_by_hand_in_browser.py",
+    *("test_page_by_hand_in_browser.py", "test_browser_module.py"),
 )
 LONG = (
     *("test_laws_contract.py", "test_pipeline.py", "test_real_servers.py", "test_drifts_of_every_case.py"),

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# onnxruntime_c.sh FOLDER: makes FOLDER/include and FOLDER/lib for examples/embed/c, without a network: the header that
+# onnxruntime_c.sh FOLDER: makes FOLDER/include and FOLDER/lib for examples/embed/c/onnxruntime, without a network: the header that
 # the package ships, and the library of the Python package onnxruntime, which is installed already. Any release of the
 # library serves a header that is no newer. A person may unpack a release archive of onnxruntime instead.
 set -euo pipefail

@@ -7,13 +7,15 @@ import os
 import tempfile
 from pathlib import Path
 
-from loopwright.pipeline.errors import HostError
+from loopwright.pipeline.errors import ExportError, HostError
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.hosts.fmu.compiling import toolchain
 from loopwright.pipeline.hosts.fmu.folder import check, pack, problems, write_folder
+from loopwright.pipeline.hosts.fmu.law_sources import plain_answers
+from loopwright.serving.conformance.steps import StepResult, answered
 from loopwright.serving.controller import Controller
 
-MEGABYTE = 1e6  # bytes
+KILOBYTE = 1e3  # bytes
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +24,11 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("file", metavar="FILE", type=Path, help="a controller's .onnx file")
     add("--out", metavar="FILE.fmu", type=Path, help="what to write (the controller's name with .fmu, here)")
     add("--fmi", choices=(2, 3), type=int, default=3, help="version of FMI: 2 for 2.0, 3 for 3.0 (3)")
-    add("--onnxruntime", metavar="FOLDER", type=Path, help="another header of onnxruntime than the shipped one")
+    add(
+        "--onnxruntime",
+        action="store_true",
+        help="put onnxruntime into the FMU, 15 MB, and compute by it",
+    )
 
 
 def run(options: argparse.Namespace) -> None:
@@ -30,7 +36,8 @@ def run(options: argparse.Namespace) -> None:
     controller = Controller(options.file)
     out: Path = Path(f"{options.file.stem}.fmu") if options.out is None else options.out
     _require_free(out)
-    tools = toolchain(options.onnxruntime)
+    tools = toolchain(onnxruntime=options.onnxruntime)
+    plain = None if options.onnxruntime else _plain_answers(controller)
     with draft_of(out) as draft, tempfile.TemporaryDirectory(prefix="loopwright-fmu-") as made:
         folder = Path(made)
         write_folder(controller, folder, options.fmi, tools)
@@ -38,9 +45,16 @@ def run(options: argparse.Namespace) -> None:
         wrong = problems(draft)
         if wrong:
             raise HostError(f"the FMU's description is not valid FMI {options.fmi}.0: {'; '.join(wrong)}")
-        steps = check(controller, draft, folder)
-    size = out.stat().st_size / MEGABYTE
-    print(f"{out}: FMI {options.fmi}.0, {size:.1f} MB, {steps} steps give the same bits as the controller file")
+        steps = check(controller, draft, folder, answered(controller) if plain is None else plain)
+    size, of = out.stat().st_size / KILOBYTE, "controller file" if plain is None else "plain C's statements"
+    print(f"{out}: FMI {options.fmi}.0, {size:.0f} kB, {steps} steps give the same bits as the {of}")
+
+
+def _plain_answers(controller: Controller) -> list[StepResult]:
+    try:
+        return plain_answers(controller)
+    except ExportError as error:
+        raise HostError(f"{error}; with --onnxruntime an FMU needs no plain C") from error
 
 
 def _require_free(out: Path) -> None:

@@ -36,7 +36,7 @@ ALL = [block for page in PAGES for block in blocks(page)]
 # Programs that a page may call, beside `loopwright` and Python: what they are given is for a person to see.
 OTHERS = {"cd", "git", "source", "export", "dask", "docker", "cp", "mlflow", "dvc", "curl", "openssl"}
 OTHERS |= {"for", "do", "done", "sleep"}
-OTHERS |= {"npm", "node", "cmake", "build/host"}
+OTHERS |= {"npm", "node", "cmake", "build/host", "build/main"}
 
 
 def of(*languages: str) -> list[Block]:

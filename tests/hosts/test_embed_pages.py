@@ -42,7 +42,10 @@ def test_the_plc_page_names_the_inputs_and_outputs() -> None:
     assert re.findall(r"`(\w+)`", row(PLC, "outputs"))[:3] == ["mv", "state_next", "info"]
 
 
-@pytest.mark.parametrize("host", ["python", "c", "node", "browser"])
+HOSTS = ["python", "c", "c/onnxruntime", "node", "browser"]
+
+
+@pytest.mark.parametrize("host", HOSTS)
 def test_each_host_has_a_short_page_that_says_the_same_four_things(host: str) -> None:
     text = (EMBED / host / "README.md").read_text()
     assert len([line for line in text.splitlines() if line.strip() and not line.startswith(("```", "<!--"))]) <= 11
@@ -50,7 +53,7 @@ def test_each_host_has_a_short_page_that_says_the_same_four_things(host: str) ->
         assert what in text
 
 
-@pytest.mark.parametrize("host", ["c", "node", "browser", "python"])
+@pytest.mark.parametrize("host", HOSTS)
 def test_each_page_says_how_a_loop_begins_and_what_a_host_lacks(host: str) -> None:
     text = (EMBED / host / "README.md").read_text().casefold()
     assert (
@@ -92,7 +95,7 @@ def test_the_manual_describes_the_kit() -> None:
         assert parts[part] == int(words.split()[0])
 
 
-PAGES = [EMBED / "README.md", *EMBED.glob("*/README.md"), ROOT / "docs" / "embedding.md"]
+PAGES = [EMBED / "README.md", *(EMBED / host / "README.md" for host in [*HOSTS, "plc"]), ROOT / "docs" / "embedding.md"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}-{page.stem}")

@@ -74,7 +74,7 @@ static int by_hand(Controller *c) {
   double pv[2] = {0.4, 300}, no_pv[2] = {NAN, 300}, mv[1] = {200}, up[1] = {275}, down[1] = {0};
   Sample good_one = {pv, NULL, mv, 0.0}, refused = {no_pv, NULL, mv, 0.0}, no_read_back = {pv, NULL, NULL, 0.0};
   Loop l;
-  c->signals[MV].at[0].max_move = 30;
+  ((Signal *)c->signals[MV].at)->max_move = 30;
   MUST(loop_open(&l, c, MANUAL, 2));
   loop_scan(&l, &good_one);
   MUST(loop_set(&l, MV, up) && l.mv[0] == 200);
@@ -110,7 +110,7 @@ static int by_hand(Controller *c) {
   loop_scan(&l, &no_read_back); /* nobody but the operator does */
   MUST(loop_writes(&l) && l.mv[0] == 275);
   loop_close(&l);
-  c->signals[MV].at[0].max_move = INFINITY;
+  ((Signal *)c->signals[MV].at)->max_move = INFINITY;
   controller_cold(c);
   return 0;
 }

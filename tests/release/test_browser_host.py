@@ -7,14 +7,10 @@ from __future__ import annotations
 
 import json
 import shutil
-import threading
-from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
-from chromium import CHROMIUM, launched
+from chromium import CHROMIUM
 from kits import DAMAGES, EMBED, PID, SOME, an_old_version, kit_of, name, spoilt, verdict_on
 
 if CHROMIUM is None:
@@ -22,42 +18,10 @@ if CHROMIUM is None:
 if not (EMBED / "browser" / "node_modules").is_dir():
     pytest.skip("onnxruntime-web is missing (npm ci in examples/embed/browser)", allow_module_level=True)
 
+from kit_on_page import conform
 from playwright.sync_api import Page, expect
 
-expect.set_options(timeout=30_000)
-
-
-class Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *words: object) -> None:
-        pass
-
-
-@pytest.fixture(scope="module")
-def page() -> Iterator[Page]:
-    """The page from a server of files alone; whatever it says of errors fails the tests."""
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=EMBED))
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    said: list[str] = []
-    with launched() as browser:
-        made = browser.new_page()
-        made.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
-        made.on("pageerror", lambda error: said.append(str(error)))
-        made.goto(f"http://127.0.0.1:{server.server_port}/browser/")
-        expect(made.locator("body")).to_have_attribute("data-ready", "yes")
-        yield made
-    server.shutdown()
-    server.server_close()
-    thread.join()
-    assert said == []
-
-
-def conform(page: Page, kit: Path) -> str:
-    page.set_input_files("#files", [str(file) for file in kit.iterdir()])
-    page.click("#conform")
-    expect(page.locator("#conform")).to_be_enabled()
-    expect(page.locator("#said")).not_to_be_empty()
-    return page.locator("#said").text_content() or ""
+pytest_plugins = ["embedded_page"]
 
 
 @pytest.mark.parametrize("file", SOME, ids=name)

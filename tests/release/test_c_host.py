@@ -1,4 +1,4 @@
-"""The C host: built with sanitizers, every shipped controller to the bit, and damaged kits that it must not pass.
+"""The C host on onnxruntime: with sanitizers, every shipped controller to the bit, and damaged kits, which do not pass.
 
 tools/onnxruntime_c.sh makes the folder with its header and library; ONNXRUNTIME_DIR names another one.
 """
@@ -40,6 +40,7 @@ if CMAKE is None or shutil.which("cc") is None:
     pytest.skip("cmake or a C compiler is missing (apt install cmake gcc)", allow_module_level=True)
 
 pytest_plugins = ["small_laws", "operated_laws", "course_files"]
+ONNXRUNTIMES = EMBED / "c" / "onnxruntime"
 SANITIZERS = "-O1 -g -Werror -fsanitize=address,undefined -fno-sanitize-recover=all"
 
 
@@ -65,7 +66,7 @@ def host(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Built as its page says."""
     assert CMAKE is not None
     folder, given = tmp_path_factory.mktemp("c"), (f"-DONNXRUNTIME_DIR={onnxruntime()}",)
-    made = run(CMAKE, "-S", EMBED / "c", "-B", folder, *given, f"-DCMAKE_C_FLAGS={SANITIZERS}")
+    made = run(CMAKE, "-S", ONNXRUNTIMES, "-B", folder, *given, f"-DCMAKE_C_FLAGS={SANITIZERS}")
     assert made.returncode == 0, made.stderr
     made = run(CMAKE, "--build", folder)
     assert made.returncode == 0, made.stdout + made.stderr
@@ -76,7 +77,7 @@ def changed_host(source: Path) -> Path:
     """A program of the host's loop with other parts around it; without cmake, which looks for a compiler each time."""
     program, library = source.with_suffix(""), onnxruntime() / "lib" / "libonnxruntime.so"
     options = ["-std=c11", "-Wall", "-Wextra", "-Wpedantic", *SANITIZERS.replace("-O1", "-O0").split()]
-    include = ["-isystem", onnxruntime() / "include"]
+    include = ["-I", ONNXRUNTIMES, "-isystem", onnxruntime() / "include"]
     made = run("cc", *options, *include, source, library, f"-Wl,-rpath,{library.parent}", "-lm", "-o", program)
     assert made.returncode == 0, made.stderr
     return program
@@ -150,7 +151,7 @@ int main(int n, char **words) {
 
 def test_a_program_around_the_c_host_steers_its_law(operated_file: Path, tmp_path: Path) -> None:
     """A value that is not allowed changes nothing; a flag that is none is a fault."""
-    (tmp_path / "steered.c").write_text(STEERED.replace("host.c", str(EMBED / "c" / "host.c")))
+    (tmp_path / "steered.c").write_text(STEERED.replace("host.c", str(ONNXRUNTIMES / "host.c")))
     done = run(changed_host(tmp_path / "steered.c"), kit_of(operated_file) / operated_file.name)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.startswith("0 1 1 1 1 fresh of y1 is 0.5; ")
@@ -174,7 +175,7 @@ def test_the_c_loop_scans_once_a_period(host: Path) -> None:
 
 def test_the_c_loop_writes_nothing_before_it_has_read_the_plant(tmp_path: Path) -> None:
     """The loop as it is shipped, on a plant that cannot be read at the first two scans and tells of each write."""
-    text = (EMBED / "c" / "host.c").read_text()
+    text = (ONNXRUNTIMES / "host.c").read_text()
     for place, more in (
         ("static bool plant_read(Plant *p, Sample *sample) {\n", "  if (p->k < 2) return p->k++, false;\n"),
         ("static bool plant_write(Plant *p, const double *mv) {\n", '  printf("written %g\\n", mv[0]);\n'),
@@ -210,7 +211,7 @@ def test_the_folder_of_onnxruntime_counts_from_where_the_user_stands(tmp_path: P
 def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:
     """Write failures, operators' mistakes and gaps, which no vector holds: tests/release/loop_faults.c."""
     (tmp_path / "host.c").write_text(Path(__file__).with_name("loop_faults.c").read_text())
-    shutil.copy(EMBED / "c" / "host.c", tmp_path / "embedded.h")
+    shutil.copy(ONNXRUNTIMES / "host.c", tmp_path / "embedded.h")
     done = run(changed_host(tmp_path / "host.c"), kit_of(PID) / "pid.onnx")
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout == "all as it must be\n"
@@ -232,6 +233,17 @@ def test_the_c_loop_meets_faults_as_ours(tmp_path: Path) -> None:
 )
 def test_a_file_that_is_not_right_is_one_line_of_the_c_host(host: Path, what: str, words: str, tmp_path: Path) -> None:
     refuses_in_one_line(partial(run, host), wrong_file(what, tmp_path), words)
+
+
+def test_the_c_host_reads_a_manifest_in_a_time_that_grows_as_its_size(host: Path, tmp_path: Path) -> None:
+    """A million escapes: read as they stand it is a moment, measured to the file's end at each it is hours."""
+    for suffix in (".onnx", ".json"):
+        shutil.copy(kit_of(PID) / f"pid{suffix}", tmp_path)
+    beside = tmp_path / "pid.json"
+    beside.write_text(beside.read_text().replace("{", '{"remark": "' + 1_000_000 * "\\u0041" + '",', 1))
+    done = run(host, tmp_path / "pid.onnx", "1", "0.01")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("0 ")
 
 
 def test_the_c_host_says_how_it_is_called(host: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import importlib
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
@@ -11,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from controller_fmus import MISSING, Array, Unit, answers_of, controller_of, file_of, tools, unpacked
+from controller_fmus import MISSING, Array, PlainSteps, Unit, answers_of, controller_of, tools, unpacked
 from kits import SHIPPED, name
 
 from loopwright.pipeline.cases import PLANTS
@@ -24,12 +26,13 @@ from loopwright.pipeline.hosts.fmu.folder import (
     pack,
     problems,
     token_of,
-    variables_of,
     write_folder,
 )
+from loopwright.pipeline.hosts.fmu.law_sources import plain_answers
+from loopwright.pipeline.hosts.fmu.variables import variables_of
 from loopwright.pipeline.plants.fmu.instance import NAMES
 from loopwright.serving import Controller
-from loopwright.serving.conformance.steps import StepResult, answered
+from loopwright.serving.conformance.steps import StepResult
 
 if MISSING:
     pytest.skip(MISSING, allow_module_level=True)
@@ -65,7 +68,7 @@ def state_of(u: Unit, of: str) -> bytes:
 
 # ------------------------------------------------------------------ the same bits
 def compared(controller: Controller, answers: list[StepResult], u: Unit) -> Counter[str]:
-    """Play a kit's steps; how many gave numbers ("") and how many were refused, and because of what."""
+    """Play a kit's steps from its states; how many gave numbers ("") and how many were refused, and because of what."""
     n, seen = controller.manifest.n_state, Counter[str]()
     groups = [group for group in controller.manifest.inputs if group != "state"]
 
@@ -77,6 +80,8 @@ def compared(controller: Controller, answers: list[StepResult], u: Unit) -> Coun
         if answer.given.cold:
             u.reset()
             u.begin(**({"use_fresh": True} if "fresh" in groups else {}))
+        if n:
+            u.read(u.written()[: -8 * n] + answer.state.tobytes())
         before = found()
         u.set(**{group: answer.given.inputs[group] for group in groups})
         u.step(controller.manifest.period_s)
@@ -103,7 +108,7 @@ def test_an_fmu_refuses_results_and_takes_measured_disturbances(
     write_folder(controller, tmp_path, fmi, tools())
     assert problems(tmp_path) == []
     with closing(Unit(tmp_path, logging=True)) as u:
-        seen = compared(controller, answered(controller), u)
+        seen = compared(controller, plain_answers(controller), u)
         assert u.names("dv")
         assert min(seen.values()) >= 15
         assert len(u.said) == seen["input"] + seen["output"]
@@ -129,7 +134,7 @@ def test_an_fmu_takes_what_operators_change(operated: tuple[Controller, Path]) -
             e.name for e in controller.manifest.operate
         ]
         assert u.names("fresh") == ["fresh.y0", "fresh.y1"]
-        seen = compared(controller, answered(controller), u)
+        seen = compared(controller, plain_answers(controller), u)
         assert seen[""] > 300
     variables = {v.name: v for v in fmpy.read_model_description(str(folder)).modelVariables}
     for e in controller.manifest.operate:
@@ -148,7 +153,7 @@ def test_an_fmu_takes_what_is_to_come(previewing: Controller, tmp_path: Path, fm
     with closing(Unit(tmp_path)) as u:
         wanted = [f"ahead.{s.group}.{s.signal}.{i}" for i in range(1, ahead.horizon + 1) for s in ahead.signals]
         assert u.names("ahead") == wanted
-        seen = compared(previewing, answered(previewing), u)
+        seen = compared(previewing, plain_answers(previewing), u)
         assert seen[""] > 300
         u.reset()
         u.begin()
@@ -162,13 +167,13 @@ def test_an_fmu_takes_what_is_to_come(previewing: Controller, tmp_path: Path, fm
 def test_without_a_value_an_fmu_has_the_defaults_and_all_is_fresh(operated: tuple[Controller, Path]) -> None:
     """A tool that writes 0 to each input without a connection blinds no law: use_fresh is false."""
     controller, folder = operated
-    state, mv = controller.cold_state(), np.zeros(2)
+    state, mv, law = controller.cold_state(), np.zeros(2), PlainSteps(controller)
     with closing(Unit(folder)) as u:
         u.begin()
         u.set(fresh=[0.0, 0.0])
         for k in range(20):
             pv = [0.3 * np.sin(k), 0.1 * k]
-            mv, state, _ = controller.step(sp=[0.5, 0], pv=pv, dv=[0.1], mv_applied=mv, state=state)
+            mv, state, _ = law.step(sp=[0.5, 0], pv=pv, dv=[0.1], mv_applied=mv, state=state)
             u.set(sp=[0.5, 0], pv=pv, dv=[0.1])
             u.step(1.0)
             assert bytes(u.get("mv")) == bytes(mv)
@@ -241,9 +246,12 @@ def test_a_saved_state_keeps_what_operators_have_changed(operated: tuple[Control
 def test_the_gate_lets_no_fmu_of_another_controller_pass(tmp_path: Path) -> None:
     one, other = twins()
     pack(unpacked(other, 3), tmp_path / "other.fmu")
-    check(controller_of(other), tmp_path / "other.fmu", unpacked(other, 3))
+    played = tmp_path / "other.fmu", unpacked(other, 3)
+    assert check(controller_of(other), *played, answers_of(other)) == len(answers_of(other))
+    with pytest.raises(HostError, match="of the conformance kit"):
+        check(controller_of(other), *played, answers_of(other, onnxruntime=True))
     with pytest.raises(HostError, match="in step 0 of the conformance kit"):
-        check(controller_of(one), tmp_path / "other.fmu", unpacked(other, 3))
+        check(controller_of(one), *played, answers_of(one))
 
 
 def twins() -> tuple[str, str]:
@@ -304,13 +312,13 @@ def test_a_call_that_is_not_allowed_says_why(opened: ExitStack) -> None:
 
 # ------------------------------------------------------------------ time
 def chained(of: str, given: list[Array], applied: list[Array] | None = None) -> list[Array]:
-    """Python's MVs for PVs (n_pv,) a sample; without ``applied`` each MV is the next sample's read-back."""
+    """The statements' MVs for PVs (n_pv,) a sample; without ``applied`` each MV is the next sample's read-back."""
     controller = controller_of(of)
-    m, state = controller.manifest, controller.cold_state()
+    m, state, law = controller.manifest, controller.cold_state(), PlainSteps(controller)
     mv, found = np.array([s.middle for s in m.mv]), []
     for k, pv in enumerate(given):
         mv_applied = mv if applied is None else applied[k]
-        mv, state, _ = controller.step(
+        mv, state, _ = law.step(
             sp=[s.middle for s in m.sp], pv=pv, dv=[s.middle for s in m.dv], mv_applied=mv_applied, state=state
         )
         found.append(mv)
@@ -515,10 +523,12 @@ def test_instances_do_not_disturb_each_other(fmi: int, opened: ExitStack) -> Non
 def test_the_description_is_valid_and_says_what_the_manifest_says(file: Path, fmi: int, tmp_path: Path) -> None:
     controller = controller_of(f"{file.parent.name}/{file.stem}")
     m = controller.manifest
-    (tmp_path / "modelDescription.xml").write_bytes(description(controller, identifier_of(file), fmi))
     (tmp_path / "sources").mkdir()
-    (tmp_path / "sources" / "buildDescription.xml").write_bytes(build_description(identifier_of(file)))
-    assert problems(tmp_path) == []
+    for onnxruntime in (True, False):
+        made_by = identifier_of(file), tools(onnxruntime=onnxruntime)
+        (tmp_path / "modelDescription.xml").write_bytes(description(controller, made_by[0], fmi, made_by[1]))
+        (tmp_path / "sources" / "buildDescription.xml").write_bytes(build_description(*made_by))
+        assert problems(tmp_path) == []
     model = fmpy.read_model_description(str(tmp_path))
     assert controller.sha256 in model.description
     assert model.guid == token_of(controller)
@@ -544,20 +554,55 @@ def test_names_that_xml_cannot_hold_or_that_are_one_twice_are_refused(tmp_path: 
     odd = copy.copy(controller_of(PID))
     odd.manifest = replace(m, law="pid\uffff")
     with pytest.raises(HostError, match="cannot hold"):
-        description(odd, "pid", 2)
+        description(odd, "pid", 2, tools())
 
 
-def test_an_fmu_has_sources_licences_and_a_page(tmp_path: Path) -> None:
-    for fmi in (2, 3):
-        folder = unpacked(PID, fmi)
-        names = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
-        assert {"documentation/index.html", "documentation/licenses/onnxruntime-LICENSE.txt"} <= names
-        assert {"sources/host.c", "sources/instance.c", f"sources/fmi{fmi}.c"} <= names
-        assert f"{tools().library_name}" == "libonnxruntime.so.1"
-        page = (folder / "documentation" / "index.html").read_text()
-        assert controller_of(PID).sha256 in page
-        assert "mv_start.T_j" in page
-        assert (folder / "resources" / "controller.onnx").read_bytes() == file_of(PID).read_bytes()
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_of_plain_c_holds_all_its_sources_and_nothing_of_onnxruntime(fmi: int, tmp_path: Path) -> None:
+    folder = unpacked(PID, fmi)
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert {"documentation/index.html", "resources/controller.json", "sources/law.c", f"sources/fmi{fmi}.c"} <= names
+    assert not [name for name in names if "onnx" in name or name.endswith("host.c")]
+    page = (folder / "documentation" / "index.html").read_text()
+    assert controller_of(PID).sha256 in page
+    assert "mv_start.T_j" in page
+    model = fmpy.read_model_description(str(folder))
+    listed = model.buildConfigurations[0].sourceFileSets[0].sourceFiles
+    assert listed == [f"fmi{fmi}.c", "law.c"]
+    tools().compile([folder / "sources" / name for name in listed], tmp_path / "again.so")
+    (library,) = (folder / "binaries").rglob("*.so")
+    assert (tmp_path / "again.so").read_bytes() == library.read_bytes()
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_tool_can_compile_the_sources_of_an_fmu(fmi: int, tmp_path: Path) -> None:
+    """fmpy's own build, of what the description lists; the library that came with the FMU is gone."""
+    folder = tmp_path / "fmu"
+    shutil.copytree(unpacked(PID, fmi), folder)
+    shutil.rmtree(folder / "binaries")
+    (tmp_path / "build").mkdir()
+    importlib.import_module("fmpy.build").build_platform_binary(folder, tmp_path / "build")
+    with closing(Unit(folder)) as u:
+        assert compared(controller_of(PID), answers_of(PID), u)[""] > 300
+
+
+def test_the_largest_controller_makes_a_small_fmu(tmp_path: Path) -> None:
+    largest = max(SHIPPED, key=lambda file: file.stat().st_size)
+    pack(unpacked(f"{largest.parent.name}/{largest.stem}", 3), tmp_path / "largest.fmu")
+    assert (tmp_path / "largest.fmu").stat().st_size <= 500_000
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_fmu_may_hold_onnxruntime_instead(fmi: int) -> None:
+    folder = unpacked(PID, fmi, onnxruntime=True)
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    assert {"resources/controller.onnx", "documentation/licenses/onnxruntime-LICENSE.txt", "sources/host.c"} <= names
+    assert not [name for name in names if "law.c" in name]
+    assert any(name.endswith("libonnxruntime.so.1") for name in names)
+    assert problems(folder) == []
+    with closing(Unit(folder)) as u:
+        seen = compared(controller_of(PID), answers_of(PID, onnxruntime=True), u)
+    assert seen[""] > 300
 
 
 # ------------------------------------------------------------------ in a tool: fmpy's own simulation, and a plant
@@ -580,10 +625,11 @@ def closed_loop(of: str, act: Callable[[Array, Array], Array]) -> tuple[Array, A
 def by_python(of: str) -> tuple[Array, Array]:
     controller = controller_of(of)
     mv, state = np.array([s.middle for s in controller.manifest.mv]), controller.cold_state()
+    law = PlainSteps(controller)
 
     def act(sp: Array, pv: Array) -> Array:
         nonlocal mv, state
-        mv, state, _ = controller.step(sp=sp, pv=pv, mv_applied=mv, state=state)
+        mv, state, _ = law.step(sp=sp, pv=pv, mv_applied=mv, state=state)
         return mv
 
     return closed_loop(of, act)

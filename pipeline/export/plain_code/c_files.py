@@ -12,7 +12,7 @@ from loopwright.pipeline.export.plain_code.c_header import printed_header
 from loopwright.pipeline.export.plain_code.c_text import PrintedStep, printed_step
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.self_test import kit_in_c, printed_self_test
-from loopwright.pipeline.export.plain_code.statements import OUTPUT
+from loopwright.pipeline.export.plain_code.statements import OUTPUT, PlainProgram
 from loopwright.serving.controller import Controller
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.version import __version__
@@ -51,17 +51,21 @@ def c_folder(controller: Controller, name: str) -> dict[str, str]:
         f"Law {m.law} of {m.case}, made of {controller.path.name} by loopwright {__version__}.\n"
         f"   sha256 of that file: {controller.sha256}"
     ).replace("*/", "* /")
-    arguments = [*program.inputs, *(n for n, count in program.outputs.items() if count)]
-    call = ", ".join(IN_GUARD[n.removeprefix(OUTPUT)] for n in arguments)
+    call = ", ".join(IN_GUARD[n] for n in arguments_of(program))
     guards = {f"{name}_guard.{end}": _of_template(f"guard.{end}", name, head, call) for end in ("h", "c")}
     return {
-        f"{name}.h": printed_header(head, m, controller.sha256, name, step),
+        f"{name}.h": printed_header(head, m, controller.sha256, name, step, arguments_of(program)),
         f"{name}.c": _source(head, name, step),
         **guards,
         f"{name}_selftest.c": printed_self_test(head, name, program, kit_in_c(controller, program)),
         "Makefile": _MAKEFILE.replace("LAW", name),
         "CMakeLists.txt": _CMAKE.replace("LAW", name),
     }
+
+
+def arguments_of(program: PlainProgram) -> list[str]:
+    """The names of what a step in C is given and gives, in its order: inputs, then mv, state_next and info."""
+    return [*program.inputs, *(n.removeprefix(OUTPUT) for n, count in program.outputs.items() if count)]
 
 
 def _of_template(file: str, name: str, head: str, call: str) -> str:

@@ -6,11 +6,17 @@ from collections.abc import Sequence
 
 from loopwright.pipeline.export.plain_code.c_text import PrintedStep
 from loopwright.pipeline.export.plain_code.printed_functions import number
-from loopwright.serving.manifest import SWITCHES, Manifest, Signal
+from loopwright.serving.manifest import INPUTS, SWITCHES, Manifest, Signal
+
+OUTPUTS = ("mv", "state_next", "info")
 
 
-def printed_header(head: str, m: Manifest, sha256: str, name: str, step: PrintedStep) -> str:
-    """``NAME.h``: sizes, ranges, entries of ``operate``, what a step takes, and its declaration; C99 and C++17."""
+def printed_header(head: str, m: Manifest, sha256: str, name: str, step: PrintedStep, arguments: Sequence[str]) -> str:
+    """``NAME.h``: sizes, ranges, entries of ``operate``, what a step takes, and its declaration; C99 and C++17.
+
+    ``arguments`` are the names of what a step is given and gives, in its order.
+    """
+    by_place = [f"(in)[{INPUTS.index(n)}]" if n in INPUTS else f"(out)[{OUTPUTS.index(n)}]" for n in arguments]
     big = name.upper()
     n_ahead = 0 if m.ahead is None else m.ahead.size
     sizes = {n: len(getattr(m, n)) for n in ("sp", "pv", "dv", "mv", "info", "operate")}
@@ -57,6 +63,11 @@ def printed_header(head: str, m: Manifest, sha256: str, name: str, step: Printed
         "",
         f"{step.declaration};",
         "",
+        "/* The same for a host of any law: in has sp, pv, dv, mv_applied, state, operate, fresh, ahead, out has mv,",
+        "   state_next, info; READS names those of in that this law reads. */",
+        f"#define {big}_CALL(in, out) {name}_step({', '.join(by_place)})",
+        f'#define {big}_READS "{" ".join(n for n in arguments if n in INPUTS)}"',
+        "",
         "#ifdef __cplusplus",
         "}",
         "#endif",
@@ -88,10 +99,14 @@ def _signals(big: str, kind: str, signals: Sequence[Signal]) -> str:
     return "\n".join(lines)
 
 
+def places_above(m: Manifest) -> list[int]:
+    """By entry of ``operate``: the place of the high end that a low end must not exceed, of any other its own."""
+    names = [e.name for e in m.operate]
+    return [names.index(f"{e.signal}.high") if e.what == "low" else i for i, e in enumerate(m.operate)]
+
+
 def _operate(big: str, m: Manifest) -> str:
     """Entries of ``operate``, in their order."""
-    names = [e.name for e in m.operate]
-    above = [names.index(f"{e.signal}.high") if e.what == "low" else i for i, e in enumerate(m.operate)]
     uses = {e.signal: i for i, e in enumerate(m.operate) if e.group == "cv" and e.what == "use"}
     use = [uses.get(s.name, -1) for s in m.pv]
     words = "\n".join(f"   [{i}] {_words(e.name)} {_words(e.unit)}".rstrip() for i, e in enumerate(m.operate))
@@ -103,7 +118,7 @@ def _operate(big: str, m: Manifest) -> str:
             _numbers(f"{big}_OPERATE_HIGH", [e.high for e in m.operate]),
             "/* 0 or 1 alone; the entry that it must not exceed, or itself; where the use of a PV stands, or -1 */",
             _integers(f"{big}_OPERATE_SWITCH", [int(e.what in SWITCHES) for e in m.operate]),
-            _integers(f"{big}_OPERATE_ABOVE", above),
+            _integers(f"{big}_OPERATE_ABOVE", places_above(m)),
             _integers(f"{big}_USE_OF_PV", use),
         ]
     )

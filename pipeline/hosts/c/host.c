@@ -4,24 +4,25 @@
                                                   plant_write. NAME=VALUE: of what operators may change, as y0.low=-1
      host --conformance KIT [ANSWERS.json]        the kit of `loopwright conformance FILE.onnx KIT`
 
-   The parts: JSON, SHA-256, controller, loop, plant, run, conformance, main. To use the controller and the loop in a
+   The parts: JSON, SHA-256, controller (beside controller.c, which lies beside this file), loop, plant, run, conformance,
+   main. To use the controller and the loop in a
    program of your own, define LOOPWRIGHT_NO_MAIN and include this file. Nothing is allocated after
    controller_open. No function sets the locale; strtod needs the "C" one, which a C program starts with. */
 
 #define _POSIX_C_SOURCE 200809L
 #include <errno.h>
-#include <math.h>
-#include <stdarg.h>
-#include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <time.h>
 
+#include "controller.c"
 #include "onnxruntime_c_api.h"
 
-enum { MAX_BYTES = 64 << 20, MAX_DEPTH = 24, LINE = 64, WORDS = 512 };
+/* Largest file, depth of lists in lists, keys of an object that is compared and entries of operate: with them the time that
+   is spent on a file grows as its size, whatever is in it. */
+enum { MAX_BYTES = 64 << 20, MAX_DEPTH = 24, MAX_KEYS = 256, MAX_ENTRIES = 1024, LINE = 64 };
 
 /* ------------------------------------------------------------------ JSON: a tree, strictly enough for our own files */
 typedef struct Json Json;
@@ -47,6 +48,17 @@ static void json_free(Json *j) {
 
 static const char *blanks(const char *p) { return p + strspn(p, " \t\r\n"); }
 
+/* The number that four hexadecimal digits stand for, or -1. */
+static int hex_digits(const char *p) {
+  int code = 0;
+  for (int k = 0; k < 4; k++) {
+    const char *digits = "0123456789abcdef0123456789ABCDEF", *at = p[k] ? strchr(digits, p[k]) : NULL;
+    if (!at) return -1;
+    code = 16 * code + (int)(at - digits) % 16;
+  }
+  return code;
+}
+
 /* The text behind an opening quote. Escapes beyond ASCII become '?': they stand in names for people only. */
 static const char *json_text(const char *p, char **text) {
   const char *end = p;
@@ -60,8 +72,8 @@ static const char *json_text(const char *p, char **text) {
     }
     const char *from = strchr("\"\\/bfnrt", p[1]), *plain = "\"\\/\b\f\n\r\t";
     if (p[1] == 'u') {
-      unsigned code = 0;
-      if (end - p < 6 || sscanf(p + 2, "%4x", &code) != 1) return NULL;
+      int code = end - p < 6 ? -1 : hex_digits(p + 2); /* not sscanf, which measures all the text behind it */
+      if (code < 0) return NULL;
       *to++ = code && code < 128 ? (char)code : '?';
       p += 6;
     } else if (from) {
@@ -150,6 +162,7 @@ static bool json_same(const Json *a, const Json *b) {
   if (!a || !b || a->kind != b->kind || a->n != b->n) return false;
   if (a->kind == J_NUMBER) return a->number == b->number;
   if (a->kind == J_TEXT) return !strcmp(a->text, b->text);
+  if (a->kind == J_OBJECT && a->n > MAX_KEYS) return false;
   for (size_t i = 0; i < a->n; i++)
     if (!json_same(&a->items[i], a->kind == J_OBJECT ? json_get(b, a->keys[i]) : &b->items[i])) return false;
   return true;
@@ -248,110 +261,31 @@ static void sha256(const uint8_t *data, size_t size, char hex[65]) {
   for (size_t i = 0; i < 8; i++) snprintf(hex + 8 * i, 9, "%08x", (unsigned)h[i]);
 }
 
-/* ------------------------------------------------------------------ the controller */
-typedef struct {
-  const char *name, *unit; /* in the manifest */
-  double low, high;
-  double *values; /* of a discrete signal */
-  size_t n_values;
-  double max_move; /* of an MV: its largest change a period; INFINITY without a limit */
-} Signal;
-
-typedef struct {
-  Signal *at;
-  size_t n;
-} Signals;
-
-typedef struct {
-  char *name; /* as y0.low; of the whole law speed */
-  const char *unit;
-  double standard, low, high; /* its default, and the engineered range */
-  bool is_switch;             /* 0 or 1 */
-  bool of_cv;                 /* of a controlled variable */
-  size_t above; /* of a low end: the place of the high one, which it must not exceed; its own place of any other */
-} Operate;
-
-enum { SP, PV, DV, MV, STATE, OPERATE, FRESH, AHEAD, INPUTS }; /* the first four have signals */
-enum { OUT_MV, OUT_STATE, OUT_INFO, OUTPUTS };
-static const char *const INPUT[INPUTS] = {"sp", "pv", "dv", "mv_applied", "state", "operate", "fresh", "ahead"};
-static const char *const OUTPUT[OUTPUTS] = {"mv", "state_next", "info"};
-
-typedef enum { STEPPED, REFUSED_INPUT, REFUSED_OUTPUT } Outcome;
-
-typedef struct {
-  Json manifest;   /* the one inside the file */
-  char digest[65]; /* of the file, SHA-256 in hexadecimal digits */
-  Signals signals[STATE]; /* sp, pv, dv, mv */
-  size_t n_in[INPUTS], n_out[OUTPUTS];
-  bool uses[INPUTS];
-  double period_s;
-  Operate *operate_entries; /* what operators may change, n_in[OPERATE] of them */
-  double *operate; /* of all steps; the defaults until controller_operate */
-  double *fresh; /* 1 for a new and good reading of each PV, else 0: all 1 unless you write them before a step */
-  double *ahead; /* differences to come of set points and measured disturbances: 0 unless you write them before a step */
-  double *state;       /* what the law remembers: the last step's state_next; zeros: no past */
-  double *in[INPUTS];  /* the session reads here */
-  double *out[OUTPUTS]; /* and writes here: mv, state_next and info of the last step */
+/* ------------------------------------------------------------------ the controller on onnxruntime */
+struct Graph {
+  Json manifest; /* the one inside the file */
   const OrtApi *ort;
   OrtEnv *env;
   OrtSession *session;
   OrtValue *in_value[INPUTS], *out_value[OUTPUTS];
-  char words[WORDS]; /* why the last call failed */
-} Controller;
-
-static bool failed(Controller *c, const char *format, ...) {
-  va_list arguments;
-  va_start(arguments, format);
-  vsnprintf(c->words, WORDS, format, arguments);
-  va_end(arguments);
-  return false;
-}
+};
 
 static bool good(Controller *c, OrtStatus *status) {
   if (!status) return true;
-  failed(c, "onnxruntime: %s", c->ort->GetErrorMessage(status));
+  failed(c, "onnxruntime: %s", c->graph->ort->GetErrorMessage(status));
   c->words[strcspn(c->words, "\r\n")] = 0;
-  c->ort->ReleaseStatus(status);
+  c->graph->ort->ReleaseStatus(status);
   return false;
-}
-
-/* State zero means: no past. Also right after any gap. */
-static void controller_cold(Controller *c) { memset(c->state, 0, c->n_in[STATE] * sizeof *c->state); }
-
-static double middle(const Signal *s) {
-  double at = (s->low + s->high) / 2, best = at;
-  for (size_t i = 0; i < s->n_values; i++)
-    if (!i || fabs(s->values[i] - at) < fabs(best - at)) best = s->values[i];
-  return best;
-}
-
-static bool among(const Signal *s, double value) {
-  for (size_t i = 0; i < s->n_values; i++)
-    if (s->values[i] == value) return true;
-  return false;
-}
-
-/* Whether a signal may have this value; `margin` widens its range by a share on both sides. NaN: false. */
-static bool may_be(const Signal *s, double value, double margin) {
-  double slack = margin * (s->high - s->low);
-  return s->low - slack <= value && value <= s->high + slack;
-}
-
-/* Whether an MV may go from `applied` to `value` in a period. The share is what rounding adds to a sum. An applied MV
-   outside the range counts as its end. */
-#define MOVE_ROUNDING 1e-9
-static bool may_move(const Signal *s, double applied, double value) {
-  double most = s->max_move + MOVE_ROUNDING * fmax(fabs(s->low), fabs(s->high));
-  return fabs(value - fmin(fmax(applied, s->low), s->high)) <= most;
 }
 
 static bool read_signals(Controller *c, const char *key, Signals *signals) {
-  const Json *list = json_get(&c->manifest, key);
+  const Json *list = json_get(&c->graph->manifest, key);
   if (!list || list->kind != J_LIST) return failed(c, "the manifest has no list %s", key);
   signals->n = list->n;
-  if (!(signals->at = calloc(list->n + 1, sizeof *signals->at))) return failed(c, "no memory");
+  Signal *at = calloc(list->n + 1, sizeof *at);
+  if (!(signals->at = at)) return failed(c, "no memory");
   for (size_t i = 0; i < list->n; i++) {
-    Signal *s = &signals->at[i];
+    Signal *s = &at[i];
     const Json *row = &list->items[i], *values = json_get(row, "values");
     *s = (Signal){.name = json_word(row, "name"), .unit = json_word(row, "unit")};
     s->low = json_number(json_get(row, "low"));
@@ -361,33 +295,30 @@ static bool read_signals(Controller *c, const char *key, Signals *signals) {
     s->max_move = move && move->kind != J_NULL ? json_number(move) : INFINITY;
     if (!(s->max_move > 0)) return failed(c, "%s %s has a max_move that is not above 0", key, s->name);
     if (!values || values->kind != J_LIST) continue;
-    if (!(s->values = calloc(values->n + 1, sizeof *s->values))) return failed(c, "no memory");
+    double *allowed = calloc(values->n + 1, sizeof *allowed);
+    if (!(s->values = allowed)) return failed(c, "no memory");
     s->n_values = values->n;
     s->max_move = INFINITY; /* it has no way between its values */
-    for (size_t k = 0; k < values->n; k++) s->values[k] = json_number(&values->items[k]);
+    for (size_t k = 0; k < values->n; k++) allowed[k] = json_number(&values->items[k]);
   }
   return true;
 }
 
-/* The place of an entry of operate by its name, as y0.low; n_in[OPERATE] where there is none. */
-static size_t operate_place(const Controller *c, const char *name) {
-  size_t i = 0;
-  while (i < c->n_in[OPERATE] && strcmp(c->operate_entries[i].name, name)) i++;
-  return i;
-}
-
 static bool read_operate(Controller *c) {
-  const Json *list = json_get(&c->manifest, "operate");
+  const Json *list = json_get(&c->graph->manifest, "operate");
   size_t n = c->n_in[OPERATE] = list && list->kind == J_LIST ? list->n : 0;
   if (list && list->kind != J_LIST) return failed(c, "the manifest's operate is no list");
-  if (!(c->operate_entries = calloc(n + 1, sizeof *c->operate_entries))) return failed(c, "no memory");
+  if (n > MAX_ENTRIES) return failed(c, "the manifest's operate has more than %d entries", MAX_ENTRIES);
+  Operate *entries = calloc(n + 1, sizeof *entries);
+  if (!(c->operate_entries = entries)) return failed(c, "no memory");
   for (size_t i = 0; i < n; i++) {
     const Json *row = &list->items[i];
     const char *signal = json_word(row, "signal"), *what = json_word(row, "what");
-    Operate *e = &c->operate_entries[i];
+    Operate *e = &entries[i];
     size_t room = strlen(signal) + strlen(what) + 2;
-    if (!(e->name = malloc(room))) return failed(c, "no memory");
-    snprintf(e->name, room, "%s%s%s", signal, *signal ? "." : "", what);
+    char *name = malloc(room);
+    if (!(e->name = name)) return failed(c, "no memory");
+    snprintf(name, room, "%s%s%s", signal, *signal ? "." : "", what);
     e->unit = json_word(row, "unit");
     e->standard = json_number(json_get(row, "default"));
     e->low = json_number(json_get(row, "low"));
@@ -399,7 +330,7 @@ static bool read_operate(Controller *c) {
   }
   for (size_t i = 0; i < n; i++) {
     char name[WORDS];
-    Operate *e = &c->operate_entries[i];
+    Operate *e = &entries[i];
     size_t stem = strlen(e->name);
     e->above = i;
     if (strcmp(json_word(&list->items[i], "what"), "low")) continue;
@@ -409,45 +340,15 @@ static bool read_operate(Controller *c) {
   return true;
 }
 
-/* Whether one value may be given, at place i of operate. NaN: false. */
-static bool operate_within(Controller *c, size_t i, double value) {
-  const Operate *e = &c->operate_entries[i];
-  if (e->low <= value && value <= e->high && (!e->is_switch || value == 0 || value == 1)) return true;
-  if (e->is_switch && e->low < e->high) return failed(c, "operate: %.200s is %.6g; allowed is 0 or 1", e->name, value);
-  return failed(c, "operate: %.200s is %.6g; allowed is %.6g to %.6g%s%.40s", e->name, value, e->low, e->high,
-                *e->unit ? " " : "", e->unit);
-}
-
-/* Whether a law may be given these n values, as the manifest's operate lists them. */
-static bool operate_allowed(Controller *c, const double *values, size_t n) {
-  for (size_t i = 0; i < n; i++)
-    if (!operate_within(c, i, values[i])) return false;
-  for (size_t i = 0; i < n; i++) {
-    const Operate *e = &c->operate_entries[i];
-    if (values[i] > values[e->above])
-      return failed(c, "operate: %.150s is %.6g, above %.150s = %.6g; a low end must not be above the high one", e->name,
-                    values[i], c->operate_entries[e->above].name, values[e->above]);
-  }
-  return true;
-}
-
-/* From the next step on the law has these values (n_in[OPERATE]). False, and nothing changed, where one is not allowed:
-   outside its engineered range, a switch neither 0 nor 1, a low end above the high one. */
-static bool controller_operate(Controller *c, const double *values) {
-  if (!operate_allowed(c, values, c->n_in[OPERATE])) return false;
-  memcpy(c->operate, values, c->n_in[OPERATE] * sizeof *values);
-  return true;
-}
-
 /* By how much set points and measured disturbances will differ from now: at each of the horizon's samples one number of
    each signal, set points first. */
 static bool read_ahead(Controller *c) {
-  const Json *ahead = json_get(&c->manifest, "ahead"), *signals = json_get(ahead, "signals");
+  const Json *ahead = json_get(&c->graph->manifest, "ahead"), *signals = json_get(ahead, "signals");
   size_t n = c->n_in[SP] + c->n_in[DV];
   double horizon = json_number(json_get(ahead, "horizon"));
   if (!ahead) return true;
   if (!(horizon >= 1 && horizon <= 10000 && horizon == floor(horizon))) return failed(c, "the manifest's ahead has no horizon");
-  if (json_number(json_get(ahead, "period_s")) != json_number(json_get(&c->manifest, "period_s")))
+  if (json_number(json_get(ahead, "period_s")) != json_number(json_get(&c->graph->manifest, "period_s")))
     return failed(c, "the manifest's ahead has another period than its law");
   if (!signals || signals->kind != J_LIST || signals->n != n)
     return failed(c, "the manifest's ahead does not list the set points and measured disturbances");
@@ -456,26 +357,14 @@ static bool read_ahead(Controller *c) {
     if (strcmp(json_word(&signals->items[k], "signal"), s->name))
       return failed(c, "the manifest's ahead has another order than its set points and measured disturbances");
   }
-  c->n_in[AHEAD] = (size_t)horizon * n;
-  return true;
-}
-
-/* Whether c->ahead may be given beside these set points and disturbances: finite, and no value to come out of its range.
-   A present value outside it may stay; one that is not finite is refused for itself. */
-static bool ahead_allowed(Controller *c, const double *const given[STATE]) {
-  size_t n_sp = c->n_in[SP], n = n_sp + c->n_in[DV];
-  for (size_t k = 0; c->uses[AHEAD] && k < c->n_in[AHEAD]; k++) {
-    const Json *listed = json_get(json_get(&c->manifest, "ahead"), "signals");
-    bool is_sp = k % n < n_sp;
-    const double *values = given[is_sp ? SP : DV];
-    double now = values ? values[k % n - (is_sp ? 0 : n_sp)] : NAN, then = now + c->ahead[k];
-    double low = json_number(json_get(&listed->items[k % n], "low")), high = json_number(json_get(&listed->items[k % n], "high"));
-    double slack = 1e-9 * (high - low);
-    if (isfinite(c->ahead[k]) && (!isfinite(now) || (then >= fmin(low, now) - slack && then <= fmax(high, now) + slack)))
-      continue;
-    return failed(c, "ahead: %.200s is %.6g at sample %zu; allowed is %.6g to %.6g", json_word(&listed->items[k % n], "signal"),
-                  then, k / n + 1, low, high);
+  double *low = calloc(n + 1, sizeof *low), *high = calloc(n + 1, sizeof *high);
+  c->ahead_low = low, c->ahead_high = high;
+  if (!low || !high) return failed(c, "no memory");
+  for (size_t k = 0; k < n; k++) {
+    low[k] = json_number(json_get(&signals->items[k], "low"));
+    high[k] = json_number(json_get(&signals->items[k], "high"));
   }
+  c->n_in[AHEAD] = (size_t)horizon * n;
   return true;
 }
 
@@ -486,24 +375,24 @@ static bool find_manifest(Controller *c, const Json *beside) {
   OrtModelMetadata *metadata = NULL;
   OrtAllocator *allocator = NULL;
   char *text = NULL;
-  bool found = good(c, c->ort->SessionGetModelMetadata(c->session, &metadata)) &&
-               good(c, c->ort->GetAllocatorWithDefaultOptions(&allocator)) &&
-               good(c, c->ort->ModelMetadataLookupCustomMetadataMap(metadata, allocator, "loopwright.manifest", &text));
-  if (found && (!text || !json_object(text, &c->manifest))) found = failed(c, "the file holds no manifest");
+  bool found = good(c, c->graph->ort->SessionGetModelMetadata(c->graph->session, &metadata)) &&
+               good(c, c->graph->ort->GetAllocatorWithDefaultOptions(&allocator)) &&
+               good(c, c->graph->ort->ModelMetadataLookupCustomMetadataMap(metadata, allocator, "loopwright.manifest", &text));
+  if (found && (!text || !json_object(text, &c->graph->manifest))) found = failed(c, "the file holds no manifest");
   for (size_t i = 0; found && i < sizeof ACTED_ON / sizeof *ACTED_ON; i++) {
-    const Json *inside = json_get(&c->manifest, ACTED_ON[i]), *other = json_get(beside, ACTED_ON[i]);
+    const Json *inside = json_get(&c->graph->manifest, ACTED_ON[i]), *other = json_get(beside, ACTED_ON[i]);
     if ((inside || other) && !json_same(inside, other))
       found = failed(c, "the JSON beside the file has another %s than the manifest inside it; get both from one place",
                      ACTED_ON[i]);
   }
-  if (text) found = good(c, c->ort->AllocatorFree(allocator, text)) && found;
-  if (metadata) c->ort->ReleaseModelMetadata(metadata);
+  if (text) found = good(c, c->graph->ort->AllocatorFree(allocator, text)) && found;
+  if (metadata) c->graph->ort->ReleaseModelMetadata(metadata);
   return found;
 }
 
 static bool read_manifest(Controller *c) {
   static const char *const KEY[STATE] = {"sp", "pv", "dv", "mv"};
-  const Json *m = &c->manifest, *inputs = json_get(m, "inputs"), *info = json_get(m, "info");
+  const Json *m = &c->graph->manifest, *inputs = json_get(m, "inputs"), *info = json_get(m, "info");
   if (json_number(json_get(m, "schema")) != 1) return failed(c, "the manifest's schema is not 1, which this host reads");
   for (int i = 0; i < STATE; i++) {
     if (!read_signals(c, KEY[i], &c->signals[i])) return false;
@@ -542,21 +431,21 @@ static bool bind(Controller *c, const OrtMemoryInfo *where, size_t n, double **b
   if (!(*buffer = aligned_alloc(LINE, bytes))) return failed(c, "no memory");
   memset(*buffer, 0, bytes);
   int64_t shape[1] = {(int64_t)n};
-  return !n || good(c, c->ort->CreateTensorWithDataAsOrtValue(where, *buffer, n * sizeof **buffer, shape, 1,
+  return !n || good(c, c->graph->ort->CreateTensorWithDataAsOrtValue(where, *buffer, n * sizeof **buffer, shape, 1,
                                                               ONNX_TENSOR_ELEMENT_DATA_TYPE_DOUBLE, value));
 }
 
 static bool open_session(Controller *c, const void *bytes, size_t size) {
   OrtSessionOptions *options = NULL;
-  bool made = good(c, c->ort->CreateEnv(ORT_LOGGING_LEVEL_FATAL, "loopwright", &c->env)) &&
-              good(c, c->ort->CreateSessionOptions(&options)) &&
-              good(c, c->ort->SetIntraOpNumThreads(options, 1)) && good(c, c->ort->SetInterOpNumThreads(options, 1)) &&
-              good(c, c->ort->SetSessionExecutionMode(options, ORT_SEQUENTIAL)) &&
-              good(c, c->ort->SetSessionGraphOptimizationLevel(options, ORT_ENABLE_ALL)) &&
-              good(c, c->ort->AddSessionConfigEntry(options, "session.intra_op.allow_spinning", "0")) &&
-              good(c, c->ort->AddSessionConfigEntry(options, "session.load_model_format", "ONNX")) &&
-              good(c, c->ort->CreateSessionFromArray(c->env, bytes, size, options, &c->session));
-  if (options) c->ort->ReleaseSessionOptions(options);
+  bool made = good(c, c->graph->ort->CreateEnv(ORT_LOGGING_LEVEL_FATAL, "loopwright", &c->graph->env)) &&
+              good(c, c->graph->ort->CreateSessionOptions(&options)) &&
+              good(c, c->graph->ort->SetIntraOpNumThreads(options, 1)) && good(c, c->graph->ort->SetInterOpNumThreads(options, 1)) &&
+              good(c, c->graph->ort->SetSessionExecutionMode(options, ORT_SEQUENTIAL)) &&
+              good(c, c->graph->ort->SetSessionGraphOptimizationLevel(options, ORT_ENABLE_ALL)) &&
+              good(c, c->graph->ort->AddSessionConfigEntry(options, "session.intra_op.allow_spinning", "0")) &&
+              good(c, c->graph->ort->AddSessionConfigEntry(options, "session.load_model_format", "ONNX")) &&
+              good(c, c->graph->ort->CreateSessionFromArray(c->graph->env, bytes, size, options, &c->graph->session));
+  if (options) c->graph->ort->ReleaseSessionOptions(options);
   return made;
 }
 
@@ -565,8 +454,8 @@ static bool agrees(Controller *c) {
   size_t has[2] = {0}, wanted[2] = {0};
   for (int i = 0; i < INPUTS; i++) wanted[0] += c->uses[i];
   for (int i = 0; i < OUTPUTS; i++) wanted[1] += c->n_out[i] > 0;
-  if (!good(c, c->ort->SessionGetInputCount(c->session, &has[0])) ||
-      !good(c, c->ort->SessionGetOutputCount(c->session, &has[1])))
+  if (!good(c, c->graph->ort->SessionGetInputCount(c->graph->session, &has[0])) ||
+      !good(c, c->graph->ort->SessionGetOutputCount(c->graph->session, &has[1])))
     return false;
   if (has[0] == wanted[0] && has[1] == wanted[1]) return true;
   return failed(c, "the graph has %zu inputs and %zu outputs, its manifest %zu and %zu", has[0], has[1], wanted[0],
@@ -579,34 +468,38 @@ static bool run_graph(Controller *c) {
   OrtValue *result[OUTPUTS];
   size_t n = 0, m = 0;
   for (int i = 0; i < INPUTS; i++)
-    if (c->uses[i]) in[n] = INPUT[i], given[n++] = c->in_value[i];
+    if (c->uses[i]) in[n] = INPUT[i], given[n++] = c->graph->in_value[i];
   for (int i = 0; i < OUTPUTS; i++)
-    if (c->n_out[i]) out[m] = OUTPUT[i], result[m++] = c->out_value[i];
-  return good(c, c->ort->Run(c->session, NULL, in, given, n, out, m, result));
+    if (c->n_out[i]) out[m] = OUTPUT[i], result[m++] = c->graph->out_value[i];
+  return good(c, c->graph->ort->Run(c->graph->session, NULL, in, given, n, out, m, result));
 }
 
 static void controller_close(Controller *c) {
+  Graph *g = c->graph;
   for (int i = 0; i < INPUTS; i++) {
-    if (c->in_value[i]) c->ort->ReleaseValue(c->in_value[i]);
+    if (g && g->in_value[i]) g->ort->ReleaseValue(g->in_value[i]);
     free(c->in[i]);
   }
   for (int i = 0; i < OUTPUTS; i++) {
-    if (c->out_value[i]) c->ort->ReleaseValue(c->out_value[i]);
+    if (g && g->out_value[i]) g->ort->ReleaseValue(g->out_value[i]);
     free(c->out[i]);
   }
   for (int i = 0; i < STATE; i++) {
-    for (size_t k = 0; c->signals[i].at && k < c->signals[i].n; k++) free(c->signals[i].at[k].values);
-    free(c->signals[i].at);
+    for (size_t k = 0; c->signals[i].at && k < c->signals[i].n; k++) free((void *)c->signals[i].at[k].values);
+    free((void *)c->signals[i].at);
   }
-  for (size_t i = 0; c->operate_entries && i < c->n_in[OPERATE]; i++) free(c->operate_entries[i].name);
-  if (c->session) c->ort->ReleaseSession(c->session);
-  if (c->env) c->ort->ReleaseEnv(c->env);
-  free(c->operate_entries);
+  for (size_t i = 0; c->operate_entries && i < c->n_in[OPERATE]; i++) free((void *)c->operate_entries[i].name);
+  if (g && g->session) g->ort->ReleaseSession(g->session);
+  if (g && g->env) g->ort->ReleaseEnv(g->env);
+  free((void *)c->operate_entries);
+  free((void *)c->ahead_low);
+  free((void *)c->ahead_high);
   free(c->operate);
   free(c->fresh);
   free(c->ahead);
   free(c->state);
-  json_free(&c->manifest);
+  if (g) json_free(&g->manifest);
+  free(g);
 }
 
 /* Load FILE.onnx and the FILE.json beside it. On false, c->words says why; close it all the same. */
@@ -618,8 +511,9 @@ static bool controller_open(Controller *c, const char *path) {
   if (stem < 6 || stem >= sizeof beside || strcmp(path + stem - 5, ".onnx"))
     return failed(c, "%s is no path of a .onnx file", path);
   snprintf(beside, sizeof beside, "%.*s.json", (int)stem - 5, path);
-  c->ort = OrtGetApiBase()->GetApi(ORT_API_VERSION);
-  if (!c->ort) return failed(c, "onnxruntime %s is older than its header", OrtGetApiBase()->GetVersionString());
+  if (!(c->graph = calloc(1, sizeof *c->graph))) return failed(c, "no memory");
+  c->graph->ort = OrtGetApiBase()->GetApi(ORT_API_VERSION);
+  if (!c->graph->ort) return failed(c, "onnxruntime %s is older than its header", OrtGetApiBase()->GetVersionString());
   char *bytes = read_file(path, &size);
   if (!bytes) return failed(c, "%s cannot be read: %s", path, strerror(errno));
   bool made = read_json(beside, &json, c->words);
@@ -630,10 +524,10 @@ static bool controller_open(Controller *c, const char *path) {
   free(bytes);
   json_free(&json);
   OrtMemoryInfo *cpu = NULL;
-  made = made && good(c, c->ort->CreateCpuMemoryInfo(OrtArenaAllocator, OrtMemTypeDefault, &cpu));
-  for (int i = 0; made && i < INPUTS; i++) made = bind(c, cpu, c->n_in[i], &c->in[i], &c->in_value[i]);
-  for (int i = 0; made && i < OUTPUTS; i++) made = bind(c, cpu, c->n_out[i], &c->out[i], &c->out_value[i]);
-  if (cpu) c->ort->ReleaseMemoryInfo(cpu);
+  made = made && good(c, c->graph->ort->CreateCpuMemoryInfo(OrtArenaAllocator, OrtMemTypeDefault, &cpu));
+  for (int i = 0; made && i < INPUTS; i++) made = bind(c, cpu, c->n_in[i], &c->in[i], &c->graph->in_value[i]);
+  for (int i = 0; made && i < OUTPUTS; i++) made = bind(c, cpu, c->n_out[i], &c->out[i], &c->graph->out_value[i]);
+  if (cpu) c->graph->ort->ReleaseMemoryInfo(cpu);
   if (!made) return false;
   c->state = calloc(c->n_in[STATE] + 1, sizeof *c->state);
   c->operate = calloc(c->n_in[OPERATE] + 1, sizeof *c->operate);
@@ -648,55 +542,6 @@ static bool controller_open(Controller *c, const char *path) {
   return run_graph(c); /* a first step, discarded: a wrong shape shows now, and code and weights are warm */
 }
 
-/* One step on given[SP], [PV], [DV], [MV] (the MV that the plant received), c->operate, c->fresh and c->ahead. The state
-   stays as it was if refused. A PV that is not fresh must be finite all the same. */
-static Outcome controller_step(Controller *c, const double *const given[STATE]) {
-  for (size_t k = 0; c->uses[FRESH] && k < c->n_in[FRESH]; k++) {
-    if (c->fresh[k] == 0 || c->fresh[k] == 1) continue;
-    failed(c, "fresh of %s is %g; it is 1 for a new and good reading, or 0", c->signals[PV].at[k].name, c->fresh[k]);
-    return REFUSED_INPUT;
-  }
-  if (!ahead_allowed(c, given)) return REFUSED_INPUT;
-  const double *const own[INPUTS] = {[STATE] = c->state, [OPERATE] = c->operate, [FRESH] = c->fresh, [AHEAD] = c->ahead};
-  for (int i = 0; i < INPUTS; i++) {
-    const double *values = i < STATE ? given[i] : own[i];
-    if (c->uses[i] && c->n_in[i] && !values) {
-      failed(c, "%s is missing; no MV is computed without it", INPUT[i]);
-      return REFUSED_INPUT;
-    }
-    for (size_t k = 0; c->uses[i] && k < c->n_in[i]; k++) {
-      if (!isfinite(values[k])) {
-        failed(c, "%s[%zu] is %g; no MV is computed from it", INPUT[i], k, values[k]);
-        return REFUSED_INPUT;
-      }
-      c->in[i][k] = values[k];
-    }
-  }
-  if (!run_graph(c)) return REFUSED_OUTPUT;
-  for (int i = 0; i < OUTPUTS; i++) {
-    for (size_t k = 0; k < c->n_out[i]; k++) {
-      if (!isfinite(c->out[i][k])) {
-        failed(c, "the law gave %s[%zu] = %g, which is not finite", OUTPUT[i], k, c->out[i][k]);
-        return REFUSED_OUTPUT;
-      }
-    }
-  }
-  for (size_t k = 0; k < c->n_in[MV]; k++) {
-    const Signal *s = &c->signals[MV].at[k];
-    double value = c->out[OUT_MV][k];
-    if (!may_be(s, value, 0) || (s->values && !among(s, value))) {
-      failed(c, "the law gave %s = %.17g %s, which it may not have", s->name, value, s->unit);
-      return REFUSED_OUTPUT;
-    }
-    if (s->max_move < INFINITY && !may_move(s, c->in[MV][k], value)) {
-      failed(c, "the law gave %s = %.17g %s after %.17g; it may move by at most %g a period", s->name, value, s->unit,
-             c->in[MV][k], s->max_move);
-      return REFUSED_OUTPUT;
-    }
-  }
-  memcpy(c->state, c->out[OUT_STATE], c->n_in[STATE] * sizeof *c->state);
-  return STEPPED;
-}
 
 /* ------------------------------------------------------------------ the loop: modes, limits, faults */
 #define PV_MARGIN 0.05        /* share of a PV's range beyond which the sensor is broken */

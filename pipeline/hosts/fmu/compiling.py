@@ -1,4 +1,4 @@
-"""The library of an FMU: what is compiled, by which compiler, with which headers and which onnxruntime."""
+"""The library of an FMU: by which compiler, with which headers, and with onnxruntime where it is wanted."""
 
 from __future__ import annotations
 
@@ -29,21 +29,22 @@ LINKED = ("-shared", "-s", "-Wl,-z,defs", "-Wl,-rpath,$ORIGIN", "-lm")
 
 @dataclass(frozen=True, slots=True)
 class Toolchain:
-    """A C compiler, the folders of the headers of onnxruntime and of FMI, and the library of onnxruntime."""
+    """A C compiler and the folders of headers; ``library`` is that of onnxruntime, None: plain C computes the law."""
 
     compiler: tuple[str, ...]
     includes: tuple[Path, ...]
-    library: Path
+    library: Path | None
 
     @property
     def library_name(self) -> str:
-        """The name under which the FMU's library looks for onnxruntime: libonnxruntime.so.1."""
-        return ".".join(self.library.name.split(".")[:3])
+        """The name under which the FMU's library looks for onnxruntime, as libonnxruntime.so.1; empty without it."""
+        return "" if self.library is None else ".".join(self.library.name.split(".")[:3])
 
-    def compile(self, source: Path, to: Path) -> None:
-        """Compile a file of ``sources`` and link it; HostError with the compiler's first error."""
-        headers = [f"-I{HOSTS / 'c'}", *(f"-isystem{folder}" for folder in self.includes)]
-        words = [*self.compiler, *FLAGS, *headers, str(source), str(self.library), "-o", str(to), *LINKED]
+    def compile(self, sources: list[Path], to: Path) -> None:
+        """Compile files of ``sources`` and link them; HostError with the compiler's first error."""
+        headers = [f"-isystem{folder}" for folder in self.includes]
+        parts = [*sources, *([] if self.library is None else [self.library])]
+        words = [*self.compiler, *FLAGS, *headers, *map(str, parts), "-o", str(to), *LINKED]
         done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
         if done.returncode:
             lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"status {done.returncode}"]
@@ -51,18 +52,21 @@ class Toolchain:
             raise HostError(f"{self.compiler[0]} cannot compile the FMU: {reason.strip()}")
 
 
-def toolchain(onnxruntime: Path | None = None) -> Toolchain:
-    """The tools of this machine; ``onnxruntime``: a folder with a header of its own in place of the shipped one.
+def toolchain(*, onnxruntime: bool = False) -> Toolchain:
+    """The tools of this machine, for an FMU of plain C or for one that holds ``onnxruntime``.
 
     Raises HostError, or PlantError for fmpy, naming what is missing.
     """
     package = fmpy()
     if sys.platform != "linux":
-        raise HostError(f"an FMU is built on Linux, because the host in C is made for it; this is {sys.platform}")
+        raise HostError(f"an FMU is built on Linux, whose libraries its options make; this is {sys.platform}")
     headers = Path(str(package.__file__)).parent / "c-code"
-    compiler, header, library = _compiler(), _header(onnxruntime), _library()
-    _require_no_older(library, header / HEADER)
-    return Toolchain(compiler, (header, headers), library)
+    compiler = _compiler()
+    if not onnxruntime:
+        return Toolchain(compiler, (headers,), None)
+    library = _library()
+    _require_no_older(library, SHIPPED / HEADER)
+    return Toolchain(compiler, (SHIPPED, headers), library)
 
 
 def _compiler() -> tuple[str, ...]:
@@ -73,18 +77,6 @@ def _compiler() -> tuple[str, ...]:
             return found, *words[1:]
     wanted = f"CC names {named[0]!r}, which is not there" if named else f"none of {', '.join(COMPILERS)} is there"
     raise HostError(f"an FMU is compiled, and no C compiler is installed: {wanted}; apt-get install gcc brings one")
-
-
-def _header(onnxruntime: Path | None) -> Path:
-    if onnxruntime is None:
-        return SHIPPED
-    for folder in (onnxruntime / "include", onnxruntime / "include" / "onnxruntime", onnxruntime):
-        if (folder / HEADER).is_file():
-            return folder
-    raise HostError(
-        f"{HEADER} is not found in {onnxruntime} or its include/; name an unpacked release archive of onnxruntime with "
-        "--onnxruntime FOLDER, or leave it away: a header is shipped"
-    )
 
 
 def _library() -> Path:

@@ -1,4 +1,4 @@
-"""The content of a controller FMU and its variables, as a folder and a zip file, and its check by the controller."""
+"""The content of a controller FMU, as a folder and a zip file, and its check by the steps that it must give."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import json
 import re
 import shutil
 import zipfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
@@ -17,13 +15,15 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from loopwright.pipeline.errors import HostError
-from loopwright.pipeline.hosts.fmu.compiling import HOSTS, SOURCES, Toolchain
+from loopwright.pipeline.files import write_text
+from loopwright.pipeline.hosts.fmu.compiling import Toolchain
+from loopwright.pipeline.hosts.fmu.law_sources import LAW, sources_of
+from loopwright.pipeline.hosts.fmu.variables import ScalarVariable, in_xml, variables_of
 from loopwright.pipeline.plants.fmu.description import described, fmpy
 from loopwright.pipeline.plants.fmu.instance import Instance
-from loopwright.serving.conformance.steps import answered
+from loopwright.serving.conformance.steps import StepResult
 from loopwright.serving.controller import Controller
 from loopwright.serving.controller_file import file_digest
-from loopwright.serving.manifest import Manifest, Signal, What
 
 LOG = {
     "logStatusError": "why a call failed",
@@ -51,6 +51,9 @@ disturbance will differ from its present value in I periods. Inputs that nothing
 is. A value to come outside its range is refused, as a sample that is not finite.</p>"""
 
 
+ONNXRUNTIMES = " It needs onnxruntime's library, which lies beside it; its licences are in licenses/."
+
+
 def token_of(controller: Controller) -> str:
     """The guid (FMI 2.0) or instantiationToken (3.0): the first 32 digits of the file's SHA-256."""
     h = controller.sha256
@@ -63,7 +66,7 @@ def words_of(controller: Controller) -> str:
     return in_xml(f"Controller {m.law} of {m.case}, period {m.period_s:g} s, SHA-256 {controller.sha256}")
 
 
-def description(controller: Controller, identifier: str, fmi: int) -> bytes:
+def description(controller: Controller, identifier: str, fmi: int, tools: Toolchain) -> bytes:
     """modelDescription.xml for FMI 2 or 3; HostError as of ``variables_of``."""
     rows = variables_of(controller.manifest)
     root = Element("fmiModelDescription", fmiVersion=f"{fmi}.0", modelName=identifier)
@@ -74,7 +77,11 @@ def description(controller: Controller, identifier: str, fmi: int) -> bytes:
     if fmi == 2:
         root.set("numberOfEventIndicators", "0")
     can = {"modelIdentifier": identifier, "canHandleVariableCommunicationStepSize": "true"}
-    SubElement(root, "CoSimulation", can | (CAN_2 if fmi == 2 else CAN_3))
+    simulated = SubElement(root, "CoSimulation", can | (CAN_2 if fmi == 2 else CAN_3))
+    if fmi == 2:  # FMI 3.0 has buildDescription.xml
+        sources = SubElement(simulated, "SourceFiles")
+        for name in compiled(fmi, tools):
+            SubElement(sources, "File", name=name)
     units = SubElement(root, "UnitDefinitions")
     for unit in sorted({row.unit for row in rows if row.unit}):
         SubElement(units, "Unit", name=unit)
@@ -86,18 +93,32 @@ def description(controller: Controller, identifier: str, fmi: int) -> bytes:
     return _written(root)
 
 
-def build_description(identifier: str) -> bytes:
-    """buildDescription.xml of FMI 3.0: what the sources in the FMU need."""
+PLAIN_WORDS = "A C compiler and FMI's headers suffice; -ffp-contract=off gives the same bits everywhere"
+HOST_WORDS = "onnxruntime_c_api.h of onnxruntime 1.21 or newer is needed beside FMI's headers"
+
+
+def build_description(identifier: str, tools: Toolchain) -> bytes:
+    """buildDescription.xml, of FMI 3.0 and read for 2.0 too: what the sources in the FMU need."""
+    plain, fmi = tools.library is None, 3
     root = Element("fmiBuildDescription", fmiVersion="3.0")
-    words = "onnxruntime_c_api.h of onnxruntime 1.21 or newer is needed beside FMI's headers"
+    words = PLAIN_WORDS if plain else HOST_WORDS
     build = SubElement(root, "BuildConfiguration", modelIdentifier=identifier, description=words)
-    files = SubElement(build, "SourceFileSet", language="C11")
-    SubElement(files, "SourceFile", name="fmi3.c")
-    SubElement(build, "Library", name="onnxruntime", external="true", description="libonnxruntime.so.1 is in binaries")
+    options = {"compiler": "gcc", "compilerOptions": "-ffp-contract=off"}
+    files = SubElement(build, "SourceFileSet", {"language": "C11"} | (options if plain else {}))
+    for name in compiled(fmi, tools):
+        SubElement(files, "SourceFile", name=name)
+    if not plain:
+        words = "libonnxruntime.so.1 is in binaries"
+        SubElement(build, "Library", name="onnxruntime", external="true", description=words)
     return _written(root)
 
 
-def page(controller: Controller) -> bytes:
+def compiled(fmi: int, tools: Toolchain) -> list[str]:
+    """The files of ``sources`` that are compiled; they include the others."""
+    return [f"fmi{fmi}.c", *([f"{LAW}.c"] if tools.library is None else [])]
+
+
+def page(controller: Controller, tools: Toolchain) -> bytes:
     """documentation/index.html."""
     m, rows = controller.manifest, variables_of(controller.manifest)
     cells = "".join(
@@ -114,8 +135,8 @@ def page(controller: Controller) -> bytes:
         f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><title>{title}</title>\n<h1>{title}</h1>\n'
         f"{SAMPLING.format(period=m.period_s)}\n{chr(10).join(further)}\n"
         "<table>\n<tr><th>variable</th><th>causality</th><th>unit</th><th>range</th><th>start</th><th>what it is</th>"
-        f"</tr>\n{cells}</table>\n<p>The FMU holds onnxruntime's library of one platform. sources/ has what was"
-        " compiled for it; the licences are in licenses/.</p>\n</html>\n"
+        f"</tr>\n{cells}</table>\n<p>The library is of one platform; sources/ has what was compiled for it."
+        f"{'' if tools.library is None else ONNXRUNTIMES}</p>\n</html>\n"
     ).encode()
 
 
@@ -179,7 +200,7 @@ def _written(root: Element) -> bytes:
 
 # ----------------------------------------------------------------------------------------------- the content of an FMU
 MADE = (1980, 1, 1, 0, 0, 0)  # the time of every entry: the same controller gives the same bytes
-ZIP_LEVEL = 1  # compression: onnxruntime's library is nearly all of the file, and 9 saves a tenth of it
+ZIP_LEVEL = 9  # compression: an FMU of plain C is small, and one with onnxruntime is written in seconds all the same
 LICENCES = ("LICENSE", "ThirdPartyNotices.txt")
 
 
@@ -192,7 +213,8 @@ def identifier_of(path: Path) -> str:
 def write_folder(controller: Controller, folder: Path, fmi: int, tools: Toolchain) -> str:
     """Write all files of an FMU (``fmi`` 2 or 3) into an empty folder; its modelIdentifier.
 
-    Raises HostError where the controller file has changed since it was loaded, or does not compile.
+    Raises HostError where the controller file has changed since it was loaded, or does not compile; ExportError where
+    its law has no plain C.
     """
     identifier = identifier_of(controller.path)
     package = fmpy()
@@ -200,17 +222,20 @@ def write_folder(controller: Controller, folder: Path, fmi: int, tools: Toolchai
     binaries, resources, sources, pages = (
         folder / "binaries" / platform, folder / "resources", folder / "sources", folder / "documentation",
     )  # fmt: skip
-    for made in (binaries, resources, sources, pages / "licenses"):
+    for made in (binaries, resources, sources, pages):
         made.mkdir(parents=True)
-    (folder / "modelDescription.xml").write_bytes(description(controller, identifier, fmi))
-    (pages / "index.html").write_bytes(page(controller))
-    _write_controller(controller, resources)
-    for source in [HOSTS / "c" / "host.c", SOURCES / "instance.c", *sorted(SOURCES.glob(f"fmi{fmi}*.c"))]:
-        shutil.copyfile(source, sources / source.name)
+    (folder / "modelDescription.xml").write_bytes(description(controller, identifier, fmi, tools))
+    (pages / "index.html").write_bytes(page(controller, tools))
+    _write_controller(controller, resources, with_graph=tools.library is not None)
+    for name, text in sources_of(controller, fmi, tools).items():
+        write_text(sources / name, text)
     if fmi == 3:
-        (sources / "buildDescription.xml").write_bytes(build_description(identifier))
-    tools.compile(SOURCES / f"fmi{fmi}.c", binaries / f"{identifier}.so")
+        (sources / "buildDescription.xml").write_bytes(build_description(identifier, tools))
+    tools.compile([sources / name for name in compiled(fmi, tools)], binaries / f"{identifier}.so")
+    if tools.library is None:
+        return identifier
     shutil.copyfile(tools.library, binaries / tools.library_name)
+    (pages / "licenses").mkdir()
     for name in LICENCES:
         licence = tools.library.parents[1] / name
         if licence.is_file():
@@ -229,166 +254,45 @@ def pack(folder: Path, to: Path) -> None:
                 made.writestr(entry, path.read_bytes(), compresslevel=ZIP_LEVEL)
 
 
-def _write_controller(controller: Controller, resources: Path) -> None:
+def _write_controller(controller: Controller, resources: Path, *, with_graph: bool) -> None:
     data = controller.path.read_bytes()
     if file_digest(data) != controller.sha256:
         raise HostError(f"{controller.path} has changed while its FMU was made; run the command again")
     manifest = json.loads(controller.manifest.to_json()) | {"sha256": controller.sha256}
-    (resources / "controller.onnx").write_bytes(data)
+    if with_graph:
+        (resources / "controller.onnx").write_bytes(data)
     (resources / "controller.json").write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
 
 
-TIME, FAULT, USE_APPLIED, FIRST = range(4)  # value references; FIRST: of the first signal
-BOOLEANS = frozenset({"fault", "use_mv_applied", "use_fresh"})
-READ_BACK = "the MV that the plant received over the last period"
-NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-
-
-@dataclass(frozen=True, slots=True)
-class ScalarVariable:
-    """A scalar variable.
-
-    ``group``: sp, pv, dv, mv_applied, mv_start, mv, info, operate, fresh, ahead; time, fault, use_mv_applied or
-    use_fresh.
-    ``low``, ``high`` and ``start`` are None where there is none.
-    """
-
-    name: str
-    reference: int
-    group: str
-    causality: str  # independent, input, output, parameter
-    words: str
-    unit: str = ""
-    low: float | None = None
-    high: float | None = None
-    start: float | bool | None = None
-
-    @property
-    def boolean(self) -> bool:
-        """Whether it is a Boolean; else it is real."""
-        return self.group in BOOLEANS
-
-
-def variables_of(m: Manifest) -> list[ScalarVariable]:
-    """All variables; HostError where two would have one name, or a name has characters that XML does not have."""
-    rows = [
-        ScalarVariable("time", TIME, "time", "independent", "simulation time", "s"),
-        ScalarVariable("fault", FAULT, "fault", "output", "the last sample was refused: its MV is the one before"),
-    ]
-    if "mv_applied" in m.inputs:
-        words = "whether mv_applied is read once it is set; otherwise its place takes the last mv"
-        rows.append(ScalarVariable("use_mv_applied", USE_APPLIED, "use_mv_applied", "parameter", words, start=True))
-    groups = [
-        ("sp", "input", m.sp if "sp" in m.inputs else (), "set point"),
-        ("pv", "input", m.pv if "pv" in m.inputs else (), "process variable"),
-        ("dv", "input", m.dv if "dv" in m.inputs else (), "measured disturbance"),
-        ("mv_applied", "input", m.mv if "mv_applied" in m.inputs else (), READ_BACK),
-        ("mv_start", "parameter", m.mv, "manipulated variable before the first sample"),
-        ("mv", "output", m.mv, "manipulated variable"),
-    ]
-    reference = FIRST
-    for group, causality, signals, words in groups:
-        for s in signals:
-            rows.append(_variable(s, reference, group, causality, words))
-            reference += 1
-    for name in m.info:
-        rows.append(
-            ScalarVariable(in_xml(f"info.{name}"), reference, "info", "output", "of the law, for people and alarms")
-        )
-        reference += 1
-    for row in _steering(m):
-        rows.append(replace(row, reference=reference))
-        reference += 1
-    names = [row.name for row in rows]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise HostError(f"two variables of the FMU would be named {twice!r}; an FMU's names must be different")
-    return rows
-
-
-OPERATED_WORDS: Mapping[What, str] = {
-    "use": "1: the law takes it into account, 0: it is out",
-    "track": "1: the set point is wanted, 0: the range alone",
-    "low": "low end of the range in which it may be",
-    "high": "high end of the range in which it may be",
-    "weight": "times that of its set point; the smaller one gives way",
-    "rank": "1: its range is kept before those of 2",
-    "max_move": "largest move a period",
-    "rest": "where it goes that nothing asks for",
-    "rest_use": "1: it goes to its rest, 0: it has none",
-    "cost": "per unit and period, beside the other costs",
-    "speed": "multiplies the law's",
-    "caution": "multiplies the law's",
-}
-
-
-def _steering(m: Manifest) -> Iterator[ScalarVariable]:
-    """``operate``, ``fresh`` and ``ahead`` of a law that reads them.
-
-    They stand last: no other variable has another reference.
-    """
-    for e in m.operate if "operate" in m.inputs else ():
-        name, unit = in_xml(f"operate.{e.name}"), "" if e.unit == "-" else in_xml(e.unit)
-        words = OPERATED_WORDS[e.what]
-        yield ScalarVariable(name, 0, "operate", "parameter", words, unit, e.low, e.high, e.default)
-    if "fresh" in m.inputs:
-        words = "1: its reading is new and good, 0: it is neither; read where use_fresh is true"
-        for s in m.pv:
-            yield ScalarVariable(in_xml(f"fresh.{s.name}"), 0, "fresh", "input", words, "", 0.0, 1.0, 1.0)
-        words = "whether fresh is read; otherwise all readings are"
-        yield ScalarVariable("use_fresh", 0, "use_fresh", "parameter", words, start=False)
-    if m.ahead is None or "ahead" not in m.inputs:
-        return
-    for i in range(1, m.ahead.horizon + 1):
-        for a in m.ahead.signals:
-            kind, span = "set point" if a.group == "sp" else "disturbance", a.high - a.low
-            words = f"this {kind} after {i} periods, minus what it is now"
-            name, unit = in_xml(f"ahead.{a.group}.{a.signal}.{i}"), "" if a.unit == "-" else in_xml(a.unit)
-            yield ScalarVariable(name, 0, "ahead", "input", words, unit, -span, span, 0.0)
-
-
-def _variable(s: Signal, reference: int, group: str, causality: str, words: str) -> ScalarVariable:
-    if s.values is not None:
-        words += f"; allowed: {', '.join(f'{value:g}' for value in s.values)}"
-    start = None if causality == "output" else s.middle
-    unit = "" if s.unit == "-" else in_xml(s.unit)
-    return ScalarVariable(in_xml(f"{group}.{s.name}"), reference, group, causality, words, unit, s.low, s.high, start)
-
-
-def in_xml(text: str) -> str:
-    """A text in one line; HostError where XML cannot hold it."""
-    if NOT_IN_XML.search(text):
-        raise HostError(f"the name {text!r} has a character that an FMU's description, which is XML, cannot hold")
-    return " ".join(text.split())
-
-
 # ------------------------------- the FMU beside its controller: the same bits in the conformance kit's steps, or no FMU
-def check(controller: Controller, fmu: Path, folder: Path) -> int:
-    """Play the kit's steps through the FMU, which lies unpacked in ``folder``; how many were compared.
+def check(controller: Controller, fmu: Path, folder: Path, steps: list[StepResult]) -> int:
+    """Play steps through the FMU, which lies unpacked in ``folder``, each from its given state; how many were compared.
 
-    A refused step must hold the last MV and info and leave the state as it was, which the steps after it show.
-    Raises HostError where a number differs by a bit, PlantError where the FMU cannot be loaded or refuses a call.
+    A refused step must hold the last MV and info and leave the state as it was. Raises HostError where a number differs
+    by a bit, PlantError where the FMU cannot be loaded or refuses a call.
     """
     rows, period = variables_of(controller.manifest), controller.manifest.period_s
     mv, info = _references(rows, "mv"), _references(rows, "info")
     groups = [name for name in controller.manifest.inputs if name != "state"]
     given_to = [reference for name in groups for reference in _references(rows, name)]
     instance, expected, k = Instance(described(fmu), folder), np.zeros(0), 0
-    steps = answered(controller)
+    n_state = 8 * controller.manifest.n_state  # bytes, which stand last in a saved state
     for number, answer in enumerate(steps):
         if answer.given.cold:
             instance.begin(_references(rows, "use_fresh"))
             k = 0
+        instance.read(instance.written()[: len(instance.written()) - n_state] + answer.state.tobytes())
         values = np.concatenate([answer.given.inputs[name] for name in groups])
         instance.step(given_to, values, k * period, period)
         k += 1
         if answer.step is not None:
             expected = np.concatenate([answer.step.mv, answer.step.info])
-        found = instance.get([*mv, *info])
-        if found.tobytes() != expected.tobytes():
+        state = answer.state if answer.step is None else answer.step.state
+        found, after = instance.get([*mv, *info]), instance.written()
+        if found.tobytes() != expected.tobytes() or after[len(after) - n_state :] != state.tobytes():
             raise HostError(
                 f"the FMU differs from {controller.path} in step {number} of the conformance kit: "
-                f"{found.tolist()} instead of {expected.tolist()}; nothing is written"
+                f"{found.tolist()} instead of {expected.tolist()}, or its state; nothing is written"
             )
     return len(steps)
 

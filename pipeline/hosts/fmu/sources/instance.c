@@ -4,11 +4,12 @@
    communication step that holds the sample; between samples the outputs are held. A sample that the controller refuses
    sets `fault`, holds the MV and leaves the law's state as it was. */
 
-#define LOOPWRIGHT_NO_MAIN
-#include "host.c"
+#define _POSIX_C_SOURCE 200809L
+#include "law_controller.c" /* plain_controller.c or onnxruntime_controller.c */
 
 #include <float.h>
-#include <locale.h>
+#include <stdint.h>
+#include <stdlib.h>
 
 /* Value references. variables.py counts them in the same way: VR_FIRST on, group after group. */
 enum { VR_TIME, VR_FAULT, VR_USE_APPLIED, VR_FIRST };
@@ -68,15 +69,6 @@ static void instance_free(Instance *i) {
   free(i);
 }
 
-/* Numbers of the manifest have decimal points, whatever the language of the program around this FMU. */
-static bool open_in_c_locale(Controller *c, const char *path) {
-  locale_t plain = newlocale(LC_ALL_MASK, "C", (locale_t)0), before = uselocale(plain);
-  bool made = controller_open(c, path);
-  uselocale(before);
-  if (plain) freelocale(plain);
-  return made;
-}
-
 /* The text that modelDescription.xml names as guid or instantiationToken: the first digits of the file's SHA-256. */
 static bool is_token_of(const Controller *c, const char *token) {
   const char *hex = c->digest;
@@ -86,10 +78,7 @@ static bool is_token_of(const Controller *c, const char *token) {
 }
 
 static bool instance_open(Instance *i, const char *token, const char *resources) {
-  char path[3500];
-  if (!resources || snprintf(path, sizeof path, "%s/controller.onnx", resources) >= (int)sizeof path)
-    return REFUSE(i, "the path of the FMU's resources is missing or too long");
-  if (!open_in_c_locale(&i->c, path)) return REFUSE(i, "%s", i->c.words);
+  if (!controller_of(&i->c, resources)) return REFUSE(i, "%s", i->c.words);
   if (!is_token_of(&i->c, token)) return REFUSE(i, "the FMU's token %s is not of its controller", token ? token : "");
   static const int OF[GROUPS] = {SP, PV, DV, MV, [G_OPERATE] = OPERATE, [G_FRESH] = FRESH, [G_USE_FRESH] = FRESH, [G_AHEAD] = AHEAD};
   size_t end = OWN;

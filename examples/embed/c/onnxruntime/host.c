@@ -1,0 +1,1 @@
+../../../../pipeline/hosts/c/host.c
