@@ -15,14 +15,13 @@ from loopwright.serving.manifest import Manifest
 
 MOST_LETTERS = 60  # of a controller's name: with what is put behind it a name stays below the 125 letters of SCL
 # Words that a case, a law or a tag could give, and that one of the three systems keeps for itself.
-RESERVED = frozenset(
-    """abs action and any array at begin bool by byte case char concat configuration const constant continue
-    date delete derivative dint div do dt dword else elsif end eno en exit exp expt false find for function goto
-    if insert int integral interface label left len limit ln log lreal max mid min mod mode_t move mux not null of
-    on operate or organization pid program real region repeat replace resource ret return right rol ror s1 sel shl shr
-    sin sint sqrt step string struct tan task then this time to tod transition trunc true type udint uint ulint union
-    until usint var version void while with word xor""".split()
-)
+_WORDS = """abs action and any array at begin bool by byte case char concat configuration const constant continue date
+    delete derivative dint div do dt dword else elsif en end eno exit exp expt false find for function goto if insert int
+    integral interface label left len limit ln log lreal max mid min mod move mux not null of on or organization program
+    real region repeat replace resource ret return right rol ror sel shl shr sin sint sqrt step string struct tan task
+    then this time to tod transition trunc true type udint uint ulint union until usint var version void while with word
+    xor"""
+RESERVED = frozenset(_WORDS.split())
 _ADDRESS = re.compile(r"(i|q|m|e|a|t|z|c|p|b|w|d|l|db|fb|fc|ob|ib|iw|id|qb|qw|qd|mb|mw|md|pi|pq|udt|sfc|sfb)\d+")
 
 
