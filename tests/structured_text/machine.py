@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from blark import transform as tree
+
 from structured_text.source import Statements, Unit, stand_in, units_of
 
 ZEROS = {"LREAL": 0.0, "DINT": 0, "INT": 0, "BOOL": False}
@@ -37,10 +38,10 @@ class Machine:
         }
         for name, unit in self.units.items():
             self._declare(name, unit)
-        for name, unit in self.units.items():
+        for unit in self.units.values():
             if unit.kind != "TYPE":
                 source = "\n".join(_Compiler(self, unit).lines())
-                exec(compile(source, f"<{unit.name}>", "exec"), self.space)  # noqa: S102
+                exec(compile(source, f"<{unit.name}>", "exec"), self.space)
 
     def make(self, name: str) -> Any:
         """A new instance of a block, a program or a structure."""
@@ -60,13 +61,14 @@ class Machine:
 
     def inputs(self, name: str) -> list[str]:
         """Names of a unit's VAR_INPUT, in their order."""
-        return [v for b in self.units[name.lower()].head.declarations if isinstance(b, tree.InputDeclarations)
-                for v, *_ in _variables(b)]  # fmt: skip
+        blocks = self.units[name.lower()].declarations
+        return [v for room, b, listed in blocks if room == "VAR_INPUT" for v, *_ in _variables(b, listed)]
 
     def _declare(self, name: str, unit: Unit) -> None:
         fields, initial = dict[str, str](), dict[str, Any]()
-        blocks = [unit.head] if unit.kind == "TYPE" else unit.head.declarations
-        for variable, kind, bounds, value in (found for b in blocks for found in _variables(b)):
+        for variable, kind, bounds, value in (
+            found for _, block, listed in unit.declarations for found in _variables(block, listed)
+        ):
             assert variable not in fields, f"{variable} twice in {unit.name}"
             fields[variable] = f"[{kind}]" if bounds else kind
             zero = ZEROS.get(kind)
@@ -80,8 +82,8 @@ class Machine:
             given = initial[variable] if bounds else [initial[variable]]
             assert kind not in ZEROS or all(type(v) is type(zero) for v in given), f"{variable} of {unit.name}"
         self.fields[name], self.initial[name] = fields, initial
-        if unit.kind == "FUNCTION":
-            self.returns[name] = str(unit.head.return_type).upper()
+        if unit.returns is not None:
+            self.returns[name] = unit.returns
 
 
 class Instance:
@@ -109,6 +111,7 @@ class _Compiler:
     def __init__(self, machine: Machine, unit: Unit) -> None:
         self.machine, self.unit, self.name = machine, unit, unit.name.lower()
         self.fields = machine.fields[self.name]
+        self.there: dict[str, str] = {}
 
     def lines(self) -> Iterator[str]:
         if self.unit.kind == "FUNCTION":
@@ -140,10 +143,14 @@ class _Compiler:
 
     def numbered(self, statements: Statements) -> Iterator[str]:
         """Statements with their own numbers again."""
-        lines = [line for s in statements.parsed for line in self.statement(s, "    ")]
-        there = {stand_in(k, n): n for k, n in enumerate(statements.numbers)}
-        for line in lines:
-            yield re.sub(r"\b9876540\d\d(\.5)?\b", lambda found: there[found[0]], line)
+        self.there = {stand_in(k, n): n for k, n in enumerate(statements.numbers)}
+        for s in statements.parsed:
+            for line in self.statement(s, "    "):
+                yield self.again(line)
+
+    def again(self, text: str) -> str:
+        """A text with the numbers that stood in it."""
+        return re.sub(r"(?<![A-Za-z\d.])987654\d\d\d(\.5)?(?!\d)", lambda found: self.there[found[0]], text)
 
     def block(self, statements: Any, indent: str) -> Iterator[str]:
         found = [] if statements is None else statements.statements
@@ -199,7 +206,7 @@ class _Compiler:
     def variable(self, v: Any) -> tuple[str, str]:
         """Text and type of a variable, an entry of an array, or what a block or a structure holds."""
         if isinstance(v, tree.SimpleVariable):
-            name = str(v.name).lower()
+            name = self.again(str(v.name).lower())
             if name == self.name:
                 return name, self.machine.returns[name]
             return name, self.fields[name]
@@ -281,12 +288,12 @@ class _Compiler:
         return f"_{name.lower()}({', '.join(given)})", self.machine.returns[name.lower()]
 
 
-def _variables(block: Any) -> Iterator[tuple[str, str, tuple[int, int] | None, Any]]:
+def _variables(block: Any, listed: str = "") -> Iterator[tuple[str, str, tuple[int, int] | None, Any]]:
     """Name, type, bounds of an array, and initial value of what a block of declarations declares."""
     items = block.declarations if isinstance(block, tree.StructureTypeDeclaration) else block.items
     for item in items:
         for declared in item.variables:
-            name = str(getattr(declared, "variable", declared)).lower()
+            name = listed or str(getattr(declared, "variable", declared)).lower()
             init = getattr(item, "init", None)
             if isinstance(init, tree.ArrayTypeInitialization):
                 (part,) = init.spec.subranges

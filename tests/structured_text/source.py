@@ -1,8 +1,8 @@
 """Structured Text as blark's trees: its Earley parser is given a block's declarations and statements one by one.
 
-A list of many numbers takes that parser minutes, so a long one is parsed with its first numbers, and all of them are
-read here, each as a literal of IEC 61131-3. Statements that differ in their numbers alone are parsed once: the numbers
-of a statement are taken out of its text, and stand in ``Statements.numbers``.
+A list of many numbers takes that parser minutes: of each kind of array it parses a list of two, and here every list is
+read number by number, each as a literal of IEC 61131-3. Statements that differ in their numbers alone, those in names
+included, are parsed once: the numbers of a statement are taken out of its text, and stand in ``Statements.numbers``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import lark
 from blark import transform as tree
 from blark.parse import get_parser
 
-FEW = 4  # numbers of a long list that blark parses
+LIST = re.compile(r"(?P<name>\w+) : ARRAY\[0\.\.(?P<last>\d+)\] OF (?P<of>\w+) := \[(?P<list>[^\]]*)\];")
 LITERAL = re.compile(r"-?\d+\.\d+(E[+-]\d\d+)?|-?\d+|TRUE|FALSE")
 FIRST = 987654000  # of the numbers that stand for others
 BEGINS, ENDS = re.compile(r"(FOR|IF|CASE|WHILE|REPEAT)\b"), re.compile(r"END_(FOR|IF|CASE|WHILE|REPEAT)\b")
@@ -37,7 +37,8 @@ class Unit:
 
     kind: str
     name: str
-    head: Any
+    returns: str | None  # type of a function
+    declarations: tuple[tuple[str, Any, str], ...]  # VAR_INPUT and so on, blark's block of one, the name of a list
     statements: tuple[Statements, ...]
     lists: dict[str, list[float]]
 
@@ -63,20 +64,41 @@ def _unit(text: str) -> Unit:
         assert all(LITERAL.fullmatch(t) for t in texts), found["name"]
         assert len(texts) == int(found["last"]) + 1, found["name"]
         lists[found["name"]] = [t == "TRUE" if t in ("TRUE", "FALSE") else _number(t) for t in texts]
-        few = ", ".join(texts[:FEW])
-        return f"{found['name']} : ARRAY[0..{len(texts[:FEW]) - 1}] OF {found['of']} := [{few}];"
+        few = {"LREAL": "-1.5, 2.0E-05", "DINT": "-1, 2", "BOOL": "TRUE, FALSE"}[found["of"]]
+        return f"a_list : ARRAY[0..1] OF {found['of']} := [{few}];"
 
-    kind, name = re.match(r"(\w+)\s+(\w+)", text).groups()  # type: ignore[union-attr]
+    kind, name, returns = re.match(r"(\w+)\s+(\w+)(?: : (\w+))?", text).groups()  # type: ignore[union-attr]
     if kind == "TYPE":
-        return Unit(kind, name, parsed(text, "iec_source").items[0].declaration, (), {})
+        structure = parsed(text, "iec_source").items[0].declaration
+        return Unit(kind, name, returns, (("STRUCT", structure, ""),), (), {})
     lines = text.splitlines()
+    assert lines[0] == f"{kind} {name}{f' : {returns}' if returns else ''}", lines[0]
     last = max((k for k, line in enumerate(lines) if line == "END_VAR"), default=0)
-    head = "\n".join([*lines[: last + 1], ";", lines[-1], ""])
-    head = re.sub(
-        r"(?P<name>\w+) : ARRAY\[0\.\.(?P<last>\d+)\] OF (?P<of>\w+) := \[(?P<list>[^\]]*)\];", shortened, head
-    )
+    blocks, room = [], ""
+    for line in _declared(lines[1 : last + 1]):
+        if line.startswith("VAR"):
+            assert not room
+            room = line
+        elif line == "END_VAR":
+            room = ""
+        else:
+            short = LIST.sub(shortened, line)
+            whole = f"FUNCTION_BLOCK x_block\n{room}\n{short}\nEND_VAR\n;\nEND_FUNCTION_BLOCK\n"
+            (block,) = parsed(whole, "iec_source").items[0].declarations
+            blocks.append((room, block, line.split()[0] if short != line else ""))
     statements = tuple(_statements(piece) for piece in _pieces(lines[last + 1 : -1]))
-    return Unit(kind, name, parsed(head, "iec_source").items[0], statements, lists)
+    return Unit(kind, name, returns, tuple(blocks), statements, lists)
+
+
+def _declared(lines: list[str]) -> Iterator[str]:
+    """Whole declarations, and what begins and ends a block of them."""
+    held = ""
+    for line in lines:
+        held += line.strip() if not held else f"\n{line.strip()}"
+        if held.startswith("VAR") or held == "END_VAR" or held.rstrip().endswith(";"):
+            yield held.rstrip()
+            held = ""
+    assert not held, held
 
 
 def stand_in(k: int, number: str) -> str:
@@ -91,7 +113,7 @@ def _statements(text: str) -> Statements:
         numbers.append(found[0])
         return stand_in(len(numbers) - 1, found[0])
 
-    shape = re.sub(r"(?<![\w.])\d+(\.\d+(E[+-]\d\d+)?)?", taken, text)
+    shape = re.sub(r"(?<![A-Za-z\d.])\d+(\.\d+(E[+-]\d\d+)?)?", taken, text)
     return Statements(tuple(parsed(shape, "statement_list").statements), tuple(numbers))
 
 

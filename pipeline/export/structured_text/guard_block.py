@@ -1,7 +1,7 @@
-"""The guard around the step as Structured Text: the cases of ``serving.guard``, with what the manifest says as constants.
+"""The guard around the step as Structured Text: the cases of ``serving.guard``, with the manifest's numbers as constants.
 
-The text is ``guard.st``. A line ``//IF NAME`` begins what a law without NAME leaves out, ``//END`` ends it. ``TABLE`` is
-an array with its values, ``ROOM`` one of zeros, ``FLAGS`` one of FALSE, and ``TOP_PV`` the last place of a PV.
+The text is ``guard.st``. A line ``//IF NAME`` begins what a law without NAME leaves out, ``//END`` ends it.
+``TABLE`` is an array with its values, ``ROOM`` one of zeros, ``FLAGS`` one of FALSE, ``TOP_PV`` the last place of a PV.
 """
 
 from __future__ import annotations
@@ -124,5 +124,11 @@ def _present(sizes: Mapping[str, int]) -> str:
     if not sizes["dv"]:
         return "present := sp_used[place];"
     n = sizes["sp"]
-    lines = [f"IF place < {n} THEN", "    present := sp_used[place];", "ELSE", f"    present := dv[place - {n}];", "END_IF;"]
+    lines = [
+        f"IF place < {n} THEN",
+        "    present := sp_used[place];",
+        "ELSE",
+        f"    present := dv[place - {n}];",
+        "END_IF;",
+    ]
     return "\n        ".join(lines)

@@ -16,11 +16,11 @@ from loopwright.serving.manifest import Manifest
 MOST_LETTERS = 60  # of a controller's name: with what is put behind it a name stays below the 125 letters of SCL
 # Words that a case, a law or a tag could give, and that one of the three systems keeps for itself.
 _WORDS = """abs action and any array at begin bool by byte case char concat configuration const constant continue date
-    delete derivative dint div do dt dword else elsif en end eno exit exp expt false find for function goto if insert int
-    integral interface label left len limit ln log lreal max mid min mod move mux not null of on or organization program
-    real region repeat replace resource ret return right rol ror sel shl shr sin sint sqrt step string struct tan task
-    then this time to tod transition trunc true type udint uint ulint union until usint var version void while with word
-    xor"""
+    delete derivative dint div do dt dword else elsif en end eno exit exp expt false find for function goto if
+    insert int integral interface label left len limit ln log lreal max mid min mod move mux not null of on or
+    organization program real region repeat replace resource ret return right rol ror sel shl shr sin sint sqrt
+    step string struct tan task then this time to tod transition trunc true type udint uint ulint union until
+    usint var version void while with word xor"""
 RESERVED = frozenset(_WORDS.split())
 _ADDRESS = re.compile(r"(i|q|m|e|a|t|z|c|p|b|w|d|l|db|fb|fc|ob|ib|iw|id|qb|qw|qd|mb|mw|md|pi|pq|udt|sfc|sfb)\d+")
 

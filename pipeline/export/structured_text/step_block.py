@@ -19,6 +19,7 @@ class StepBlock:
     """The text of ``NAME_step``, and what it takes."""
 
     text: str
+    program: PlainProgram  # as it is printed, without copies
     inputs: tuple[str, ...]  # of the graph, without the state
     own_functions: tuple[str, ...]  # of elementary
     work_bytes: int  # of its own arrays, in the instance
@@ -60,7 +61,7 @@ def printed_step_block(program: PlainProgram, name: str) -> StepBlock:
     ]
     table_bytes = sum(8 * len(v) for _, v in layout.kept()) + sum(4 * len(t) for t in program.tables.values())
     own_functions = tuple(layout.own_functions())
-    return StepBlock("\n".join(lines), inputs, own_functions, 8 * layout.memory.size, table_bytes)
+    return StepBlock("\n".join(lines), layout.program, inputs, own_functions, 8 * layout.memory.size, table_bytes)
 
 
 class _Printer:

@@ -12,10 +12,13 @@ import pytest
 from identified_models import random_model
 from kits import SOME, name
 from predictive_loops import law_of
+from shipped_files import SHIPPED
 from structured_text.machine import Machine
 
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.export.plain_code import elementary
+from loopwright.pipeline.export.plain_code.c_text import printed_step
+from loopwright.pipeline.export.plain_code.interpreter import run_statement
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.self_test import kit_in_c
 from loopwright.pipeline.export.structured_text.elementary_functions import printed_function
@@ -52,6 +55,24 @@ def test_steps_of_a_law_that_operators_steer(tmp_path: Path, sizes: tuple[int, i
     model = random_model(5, n_y=n_y, n_mv=n_mv, n_dv=n_dv)
     export(law_of(model, horizon=15, operate={}, preview="course"), tmp_path / "law.onnx", case="made", provenance={})
     assert wrong_steps(tmp_path / "law.onnx") == []
+
+
+@pytest.mark.parametrize("file", SHIPPED, ids=name)
+def test_no_step_divides_by_zero_overflows_or_makes_a_nan(file: Path) -> None:
+    """Some PLCs stop there."""
+    program = lowered(onnx.load(file))
+    given = kit_in_c(Controller(file), program).given
+    steps = len(given["sp"])
+    arrays = {n: np.zeros((steps, count)) for n, count in {**program.outputs, **program.arrays}.items()}
+    arrays |= {n: np.array(given[n]) for n in program.inputs} | dict(program.constants)
+    with np.errstate(divide="raise", over="raise", invalid="raise"):
+        for s in program.statements:
+            run_statement(s, arrays, program.tables)
+
+
+def test_both_texts_count_the_same_operations() -> None:
+    program = lowered(onnx.load(SOME[0]))
+    assert printed_step_block(program, "x").program.operations == printed_step(program, "x").operations
 
 
 def test_another_digit_and_another_order_of_a_sum_are_found() -> None:
