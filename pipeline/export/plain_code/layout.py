@@ -16,7 +16,7 @@ INFIX: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
 @dataclass(frozen=True, slots=True)
 class PrintedLayout:
-    """What both texts share: the program, where its arrays lie, and the names of its constants."""
+    """Shared by both texts: the program, where its arrays lie, and the names of its constants."""
 
     program: PlainProgram
     memory: WorkMemory

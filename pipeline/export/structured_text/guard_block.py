@@ -1,4 +1,4 @@
-"""The guard around the step as Structured Text: the cases of ``serving.guard``, with the manifest's numbers as constants.
+"""The guard around the step as Structured Text: the cases of ``serving.guard``, the manifest's numbers as constants.
 
 The text is ``guard.st``. A line ``//IF NAME`` begins what a law without NAME leaves out, ``//END`` ends it.
 ``TABLE`` is an array with its values, ``ROOM`` one of zeros, ``FLAGS`` one of FALSE, ``TOP_PV`` the last place of a PV.
@@ -120,7 +120,7 @@ def _fields_read(m: Manifest) -> list[str]:
 
 
 def _present(sizes: Mapping[str, int]) -> str:
-    """What a place of ``ahead`` is now: a set point or a measured disturbance."""
+    """Statements for the present value at a place of ``ahead``: a set point or a measured disturbance."""
     if not sizes["dv"]:
         return "present := sp_used[place];"
     n = sizes["sp"]

@@ -20,7 +20,7 @@ _TWICE = {"dot": 2, "sum_squares": 2, "clip": 2, "sign": 2}  # operations an ent
 
 @dataclass(frozen=True, slots=True)
 class StepCounts:
-    """What a step does at most: operations of LREAL, entries of arrays that are read or written, rounds of loops.
+    """A step's work, at most: operations of LREAL, entries of arrays that are read or written, rounds of loops.
 
     Each operation of a printed function counts as a round, too.
     """

@@ -50,7 +50,7 @@ def st_folder(controller: Controller, name: str) -> tuple[dict[str, str], list[s
 
 
 def _about(m: Manifest, step: StepBlock) -> list[str]:
-    """What a user of the step must know, in its head."""
+    """Lines of the head: signals, memory, operations."""
     lines = [
         f"   One call a period of {lreal(m.period_s)} s, in a task of its own. Values are in engineering units. The",
         "   step checks nothing; the guard does. It needs LREAL as IEEE 754 doubles, and SQRT.",
