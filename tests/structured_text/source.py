@@ -7,6 +7,7 @@ included, are parsed once: the numbers of a statement are taken out of its text,
 
 from __future__ import annotations
 
+import gc
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -138,8 +139,11 @@ def _pieces(lines: list[str]) -> Iterator[str]:
 @cache
 def parsed(text: str, start: str) -> Any:
     """blark's tree of a text."""
+    gc.disable()  # an Earley parser makes many objects at once, and beside torch each collection is slow
     try:
         found = get_parser().parse(text, start=start)
     except lark.exceptions.LarkError as error:
         raise AssertionError(f"blark does not read\n{text}\n{error}") from error
+    finally:
+        gc.enable()
     return tree.GrammarTransformer([]).transform(found)
