@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Any
 
 from loopwright.pipeline.export.plain_code import elementary
-from loopwright.pipeline.export.structured_text.iec_names import RESERVED, array_of, typed
+from loopwright.pipeline.export.structured_text.iec_names import RESERVED, array_of, lreal, typed
 
 _SIGNS: dict[type[Any], str] = {
     ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "/", ast.Mod: "MOD",
@@ -58,7 +58,7 @@ def constant(name: str) -> str:
 
 
 def _constant(value: Any) -> str:
-    return f"LREAL := {typed(value)}" if isinstance(value, float) else array_of("LREAL", value)
+    return f"LREAL := {lreal(value)}" if isinstance(value, float) else array_of("LREAL", value)
 
 
 class _InText:

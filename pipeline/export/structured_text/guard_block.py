@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 
-from loopwright.pipeline.export.structured_text.iec_names import array_of, comment, field_names, lreal, typed
+from loopwright.pipeline.export.structured_text.iec_names import array_of, comment, field_names, lreal
 from loopwright.pipeline.export.structured_text.step_block import StepBlock
 from loopwright.serving.manifest import SWITCHES, Manifest, Signal
 
@@ -37,8 +37,8 @@ def printed_guard(m: Manifest, name: str, step: StepBlock) -> list[str]:
         (r"FLAGS (\w+)", lambda t: f"ARRAY[0..{sizes[t[1].lower()] - 1}] OF BOOL"),
         (r"\bTOP_(\w+)", lambda t: str(sizes[t[1].lower()] - 1)),
         (r"\bN_AHEAD_SIGNALS\b", lambda t: str(sizes["sp"] + sizes["dv"])),
-        (r"\bBRIDGE_S\b", lambda t: typed(BRIDGED_PERIODS * m.period_s)),
-        (r"\bPERIOD_S\b", lambda t: typed(m.period_s)),
+        (r"\bBRIDGE_S\b", lambda t: lreal(BRIDGED_PERIODS * m.period_s)),
+        (r"\bPERIOD_S\b", lambda t: lreal(m.period_s)),
         (r"\bOPERATE_FIELDS\b", lambda t: "\n".join(_fields_read(m))),
         (r"\bPRESENT_VALUE\b", lambda t: _present(sizes)),
         (r"\bCALL\b", lambda t: ", ".join(given)),
@@ -54,7 +54,7 @@ def printed_operate_type(m: Manifest, name: str) -> str:
         return ""
     names = field_names([e.name for e in m.operate])
     rows = [
-        f"    {field} : LREAL := {typed(e.default)}; "
+        f"    {field} : LREAL := {lreal(e.default)}; "
         f"(* {comment(f'{e.name} {e.unit}'.strip())}, {lreal(e.low)} to {lreal(e.high)} *)"
         for field, e in zip(names, m.operate, strict=True)
     ]

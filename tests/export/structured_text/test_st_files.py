@@ -56,10 +56,9 @@ def test_the_vectors_of_a_pid_find_no_fault(tmp_path: Path) -> None:
 def test_the_vectors_of_a_law_that_operators_steer_find_no_fault(steered: dict[str, str]) -> None:
     assert verdict(steered) == (0, 0)
     assert (
-        "TYPE tank_operate :\nSTRUCT\n    y0_use : LREAL := LREAL#1.0; (* y0.use, 0.0 to 1.0 *)\n"
-        in steered["tank_guard.st"]
+        "TYPE tank_operate :\nSTRUCT\n    y0_use : LREAL := 1.0; (* y0.use, 0.0 to 1.0 *)\n" in steered["tank_guard.st"]
     )
-    assert "\n    y1_low : LREAL := (-LREAL#0.5);" in steered["tank_guard.st"]
+    assert "\n    y1_low : LREAL := -0.5;" in steered["tank_guard.st"]
 
 
 def test_the_vectors_find_a_wrong_digit_and_a_wrong_guard(tmp_path: Path) -> None:
@@ -85,7 +84,7 @@ def test_xml_holds_the_same_blocks(steered: dict[str, str]) -> None:
         variables = [v.attrib["name"] for v in pou.iter(f"{SPACE}variable")]
         assert variables == list(machine.fields[unit])
         for v in pou.iter(f"{SPACE}variable"):
-            values = [float(x.attrib["value"].replace("LREAL#", "").strip("()")) for x in v.iter(f"{SPACE}simpleValue")
+            values = [float(x.attrib["value"]) for x in v.iter(f"{SPACE}simpleValue")
                       if x.attrib["value"] not in ("TRUE", "FALSE")]  # fmt: skip
             held = machine.initial[unit][v.attrib["name"]]
             if values:
