@@ -58,7 +58,7 @@ def printed_operate_type(m: Manifest, name: str) -> str:
         f"(* {comment(f'{e.name} {e.unit}'.strip())}, {lreal(e.low)} to {lreal(e.high)} *)"
         for field, e in zip(names, m.operate, strict=True)
     ]
-    return "\n".join([f"TYPE {name}_operate :", "STRUCT", *rows, "END_STRUCT", "END_TYPE\n"])
+    return "\n".join([f"TYPE {name}_operate :", "STRUCT", *rows, "END_STRUCT;", "END_TYPE\n"])
 
 
 def _chosen(text: str, has: set[str]) -> str:
