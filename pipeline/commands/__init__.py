@@ -32,6 +32,7 @@ COMMANDS = {
     "verify": "say which of some keys signed a controller file, or fail",
     "conformance": "write test vectors of a controller file for a host in any language, or check its answers",
     "c": "write a controller file as plain C without heap and library, for microcontrollers and programs of your own",
+    "st": "write a controller file as Structured Text for a PLC: blocks, guard, test vectors, PLCopen XML",
     "fmu": "write a controller file as a Functional Mock-up Unit, for Simulink, Modelica tools and test benches",
     "laws": "list the control laws, or the parameters of one",
     "models": "list the kinds of model, or the parameters of one",

@@ -19,6 +19,7 @@ OPENED = {
     "loopwright/serving/page/static": {".js", ".css", ".html", ".svg"},
     "loopwright/pipeline/report/templates": {".j2"},
     "loopwright/pipeline/export/plain_code": {".c", ".h"},
+    "loopwright/pipeline/export/structured_text": {".st"},
     "loopwright/pipeline/hosts/c": {".c"},
     "loopwright/pipeline/hosts/c/onnxruntime": {".h"},
     "loopwright/pipeline/hosts/javascript": {".mjs"},

@@ -5,15 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from loopwright.pipeline.export.plain_code.memory import WorkMemory, laid_out, without_copies
+from loopwright.pipeline.export.plain_code.layout import EXTREMES, INFIX, OWN, WIDTH, PrintedLayout
 from loopwright.pipeline.export.plain_code.printed_functions import functions_in_c, number
-from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, Places, PlainProgram, PlainStatement
+from loopwright.pipeline.export.plain_code.statements import Floats, Place, Places, PlainProgram, PlainStatement
 
-WIDTH = 100  # characters of a line of numbers
-_INFIX = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 _COMPARED = {"less": "<", "less_equal": "<=", "greater": ">", "greater_equal": ">=", "equal": "=="}
-_EXTREMES = {"largest": "max", "least": "min"}
-_OWN = {"exp": "plain_exp", "log": "plain_log", "tanh": "plain_tanh"}
 # Bodies of the small functions, by operation: parameters, result.
 _SMALL = {
     "abs": ("double a", "a < 0.0 ? -a : a"),
@@ -41,18 +37,16 @@ def printed_step(program: PlainProgram, name: str) -> PrintedStep:
     Each statement is a nest of loops as it stands in ``program``. Multiplication and addition are not contracted where
     the compiler keeps to what ``Makefile`` says (``-ffp-contract=off``).
     """
-    program = without_copies(program)
-    memory = laid_out(program)
-    printer = _Printer(program, memory)
-    used = {_EXTREMES.get(s.op, s.op) for s in program.statements}
-    own = [function for op, function in _OWN.items() if op in used]
+    layout = PrintedLayout.of(program)
+    program, memory, own, used = layout.program, layout.memory, layout.own_functions(), layout.operations
+    printer = _Printer(layout)
     small = [
         f"static double plain_{op}({given})\n{{\n    return {result};\n}}\n"
         for op, (given, result) in _SMALL.items()
         if op in used
     ]
     inputs = [f"const double {n}[{count}]" for n, count in program.inputs.items()]
-    outputs = [f"double {printer.name(n)}[{count}]" for n, count in program.outputs.items() if count]
+    outputs = [f"double {layout.name(n)}[{count}]" for n, count in program.outputs.items() if count]
     declaration = f"void {name}_step({', '.join([*inputs, *outputs])})"
     lines = [
         *([functions_in_c(own)] if own else []),
@@ -69,30 +63,17 @@ def printed_step(program: PlainProgram, name: str) -> PrintedStep:
 
 
 class _Printer:
-    def __init__(self, program: PlainProgram, memory: WorkMemory) -> None:
-        self.program, self.memory = program, memory
-        self.names: dict[str, str] = {}
-        seen: dict[bytes, str] = {}
-        for name, values in program.constants.items():
-            self.names[name] = seen.setdefault(values.tobytes(), name)
-
-    def name(self, buffer: str) -> str:
-        """The name of an input, an output or a constant in the text."""
-        return self.names.get(buffer, buffer.removeprefix(OUTPUT))
+    def __init__(self, layout: PrintedLayout) -> None:
+        self.layout, self.program, self.memory = layout, layout.program, layout.memory
 
     def tables(self) -> Iterator[str]:
-        for name, values in self._kept():
+        for name, values in self.layout.kept():
             yield _numbers("double", name, values)
         for name, places in self.program.tables.items():
             yield _numbers("unsigned short", name, places)
 
     def table_bytes(self) -> int:
-        return sum(8 * len(v) for _, v in self._kept()) + sum(2 * len(t) for t in self.program.tables.values())
-
-    def _kept(self) -> Iterator[tuple[str, Floats]]:
-        for name, values in self.program.constants.items():
-            if len(values) > 1 and self.names[name] == name:
-                yield name, values
+        return sum(8 * len(v) for _, v in self.layout.kept()) + sum(2 * len(t) for t in self.program.tables.values())
 
     def statement(self, s: PlainStatement) -> Iterator[str]:
         indent, outer = "    ", len(s.loops) - s.summed
@@ -109,7 +90,7 @@ class _Printer:
             yield f"{indent}}}"
 
     def _together(self, s: PlainStatement, target: str, indent: str, outer: int) -> Iterator[str]:
-        extreme = _EXTREMES.get(s.op)
+        extreme = EXTREMES.get(s.op)
         args = [self.entry(p) for p in s.args]
         if not outer:
             yield f"{indent}{{"
@@ -141,7 +122,7 @@ class _Printer:
             return number(float(values[0])) if values[0] >= 0 else f"({number(float(values[0]))})"
         start = self.memory.starts.get(place.buffer, 0)
         terms = [f"{s} * {_counter(d)}" if s != 1 else _counter(d) for d, s in enumerate(place.strides[:loops]) if s]
-        name = "w" if place.buffer in self.memory.starts else self.name(place.buffer)
+        name = "w" if place.buffer in self.memory.starts else self.layout.name(place.buffer)
         if place.table:
             inner = " + ".join([*terms, *([str(place.offset)] if place.offset or not terms else [])])
             return f"{name}[{f'{start} + ' if start else ''}{place.table}[{inner}]]"
@@ -156,8 +137,8 @@ def _value(op: str, args: Sequence[str]) -> str:
         return f"-{args[0]}"
     if op == "not":
         return f"{args[0]} == 0.0 ? 1.0 : 0.0"
-    if op in _INFIX:
-        return f"{args[0]} {_INFIX[op]} {args[1]}"
+    if op in INFIX:
+        return f"{args[0]} {INFIX[op]} {args[1]}"
     if op in _COMPARED:
         return f"{args[0]} {_COMPARED[op]} {args[1]} ? 1.0 : 0.0"
     if op in ("and", "or"):
@@ -166,7 +147,7 @@ def _value(op: str, args: Sequence[str]) -> str:
         return f"{args[0]} != 0.0 ? {args[1]} : {args[2]}"
     if op == "sqrt":
         return f"sqrt({args[0]})"
-    return f"{_OWN.get(op, f'plain_{op}')}({', '.join(args)})"
+    return f"{OWN.get(op, f'plain_{op}')}({', '.join(args)})"
 
 
 def _counter(depth: int) -> str:
