@@ -81,6 +81,9 @@ class ControlLoop:
         which the loop holds after it. See ``loopwright.serving.bridging``.
     local_s
         Time for which an MV may be elsewhere than it was commanded [s], see ``loopwright.serving.mvs.local_mvs``.
+    learns
+        Whether a law with ``operate`` goes on from what is commanded where others command, by a second step in such a
+        scan; else from its own last MV, as hosts in other languages do.
 
     Raises
     ------
@@ -107,6 +110,7 @@ class ControlLoop:
         bridge_s: float | None = None,
         critical: Sequence[str] = (),
         local_s: float | None = None,
+        learns: bool = True,
     ) -> None:
         mode = mode_of(mode)
         if recover_after is not None and recover_after < 1:
@@ -124,7 +128,7 @@ class ControlLoop:
         self.recover_after = recover_after
         self.clock: Clock = clock or MonotonicClock()
         self.warm_lead_s = min(warm_lead_s, manifest.period_s / 4)
-        self.max_gap = max_gap
+        self.max_gap, self.learns = max_gap, learns
         self.fallback = fallback
         if fallback is not None:
             fallback.check(manifest.mv)
@@ -351,7 +355,8 @@ class ControlLoop:
         elif self.mode is Mode.SHADOW:
             self._mv = applied.copy()
         try:
-            self._active.learn(self._mv)
+            if self.learns:
+                self._active.learn(self._mv)
         except Exception as error:  # the MV of this scan is known; the next one begins without a past
             self._active.begin_cold(first_line(error))
         before = self.controller

@@ -92,6 +92,7 @@ def scanned(controller: Controller) -> list[Scanned]:
         mode=Mode.AUTO,
         recover_after=begin.recover_after,
         max_gap=begin.max_gap,
+        learns=False,  # what every host does: one step a scan
     )
     course, stands, done = _Course(controller.manifest), actuators(controller.manifest), []
     scans = _scans(controller.manifest, course.sample(stands))

@@ -4,6 +4,8 @@
    yours: the step is the law's and stays as it is; here you add what your plant needs. Nothing is allocated, nothing is
    read or written but through the arguments, and each call ends after a fixed number of operations. */
 
+#include <stddef.h>
+
 #include "lower_guard.h"
 
 #define PV_MARGIN 0.05        /* share of a PV's range beyond which its sensor is broken */
@@ -95,7 +97,7 @@ static int trusted(lower_loop *l, const lower_sample *s, int *bad)
     for (k = 0; k < UPPER_N_PV; ++k) {
         const int number = is_finite(s->pv[k]);
         const int in_range = number && may_be(s->pv[k], UPPER_PV_LOW[k], UPPER_PV_HIGH[k], PV_MARGIN);
-        if (bad != 0) {
+        if (bad != NULL) {
             bad[k] = !in_range;
         } else if (!number) {
             fail(l, UPPER_PV_NUMBER, k);
@@ -115,7 +117,7 @@ static int trusted(lower_loop *l, const lower_sample *s, int *bad)
         fail(l, UPPER_READ_BACK, k);
         return 0;
     }
-    for (k = 0; k < UPPER_N_PV && bad == 0; ++k) {
+    for (k = 0; k < UPPER_N_PV && bad == NULL; ++k) {
         if (!may_be(s->pv[k], UPPER_PV_LOW[k], UPPER_PV_HIGH[k], PV_MARGIN)) {
             fail(l, UPPER_PV_RANGE, k);
             return 0;
@@ -276,11 +278,11 @@ static void take(lower_loop *l, const lower_sample *s)
 {
     int good_one = 0;
     int k;
-    const double *pv = s != 0 ? s->pv : l->pv;
-    if (s == 0) {
+    const double *pv = s != NULL ? s->pv : l->pv;
+    if (s == NULL) {
         fail(l, UPPER_NOT_READ, 0);
     } else {
-        good_one = trusted(l, s, UPPER_USES_FRESH ? l->bad : 0);
+        good_one = trusted(l, s, UPPER_USES_FRESH ? l->bad : NULL);
     }
     if (!good_one) {
         missed(l, 1.0);
@@ -291,13 +293,13 @@ static void take(lower_loop *l, const lower_sample *s)
         pv = l->pv;
     }
 #endif
-    if (s != 0) {
+    if (s != NULL) {
         find(l, s, good_one);
     }
     for (k = 0; k < UPPER_N_MV; ++k) {
         l->before[k] = l->mv[k];
     }
-    if (s == 0 || !good_one) {
+    if (s == NULL || !good_one) {
         return;
     }
     if (!s->has_mv_applied && !lower_writes(l)) {
@@ -341,7 +343,12 @@ void lower_begin(lower_loop *l, lower_mode mode, long recover_after)
         l->sp[k] = UPPER_SP_MIDDLE[k];
     }
     for (k = 0; k < UPPER_N_MV; ++k) {
-        l->mv[k] = l->before[k] = l->applied[k] = l->wanted[k] = l->law[k] = UPPER_MV_MIDDLE[k];
+        const double middle = UPPER_MV_MIDDLE[k];
+        l->mv[k] = middle;
+        l->before[k] = middle;
+        l->applied[k] = middle;
+        l->wanted[k] = middle;
+        l->law[k] = middle;
     }
     for (k = 0; k < UPPER_N_INFO; ++k) {
         l->info[k] = 0.0;
@@ -349,7 +356,10 @@ void lower_begin(lower_loop *l, lower_mode mode, long recover_after)
     for (k = 0; k < UPPER_N_PV; ++k) {
         l->pv[k] = 0.5 * (UPPER_PV_LOW[k] + UPPER_PV_HIGH[k]);
         l->gone[k] = 0.0;
-        l->bad[k] = l->shed[k] = l->read[k] = l->critical[k] = 0;
+        l->bad[k] = 0;
+        l->shed[k] = 0;
+        l->read[k] = 0;
+        l->critical[k] = 0;
         l->fresh[k] = 1.0;
     }
 #if UPPER_N_OPERATE > 0
@@ -368,7 +378,10 @@ void lower_begin(lower_loop *l, lower_mode mode, long recover_after)
     l->which = 0;
     l->recover_after = recover_after;
     l->good = 0;
-    l->held = l->lost = l->by_hand = l->known = 0;
+    l->held = 0;
+    l->lost = 0;
+    l->by_hand = 0;
+    l->known = 0;
     l->max_gap = 3.0;
 }
 
@@ -463,7 +476,7 @@ void lower_unwritten(lower_loop *l)
 
 int lower_scan(lower_loop *l, const lower_sample *s)
 {
-    if (l->by_hand && !l->known && (s == 0 || !s->has_mv_applied)) { /* nobody but the operator says where it is */
+    if (l->by_hand && !l->known && (s == NULL || !s->has_mv_applied)) { /* nobody but the operator says where it is */
         for (int k = 0; k < UPPER_N_MV; ++k) {
             l->mv[k] = l->wanted[k];
         }

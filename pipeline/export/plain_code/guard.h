@@ -53,11 +53,19 @@ typedef struct {
     double ahead[UPPER_ROOM(UPPER_N_AHEAD)];     /* differences from now of set points and disturbances to come */
     /* What the loop remembers; leave it. */
     double state[UPPER_ROOM(UPPER_N_STATE)];
-    double before[UPPER_N_MV], applied[UPPER_N_MV], wanted[UPPER_N_MV], law[UPPER_N_MV];
-    double pv[UPPER_N_PV], gone[UPPER_N_PV];
-    int bad[UPPER_N_PV], shed[UPPER_N_PV], read[UPPER_N_PV];
+    double before[UPPER_N_MV];
+    double applied[UPPER_N_MV];
+    double wanted[UPPER_N_MV];
+    double law[UPPER_N_MV];
+    double pv[UPPER_N_PV];
+    double gone[UPPER_N_PV];
+    int bad[UPPER_N_PV];
+    int shed[UPPER_N_PV];
+    int read[UPPER_N_PV];
     long good;
-    int known, lost, by_hand;
+    int known;
+    int lost;
+    int by_hand;
 } lower_loop;
 
 /* Begin without a past, set points in the middle of their ranges. Nothing is written until a good sample says where the
