@@ -21,6 +21,8 @@ defaults and gates, and the shipped file steps the same days, beside the NMPC. W
 temporary files until the product's code or the plant changes. A plant that is refused, or that ships no predictive
 file, is a row that says so. Half an hour of one core a plant.
 
+``--solved``: ours beside its own law with each quadratic problem solved to its end, in place of sweeps: some minutes.
+
 ``--operating``: priorities where ranges are at odds, and bumps of changes, on the files of three plants instead.
 ``--json FILE`` keeps the figures, ``--picture FILE`` draws the first day of the first plant.
 """
@@ -41,6 +43,7 @@ from mixing import BLENDER, TANK
 from moving import PUMPS, REACTOR
 from operated_plant import DAY
 from separating import COLUMN, EVAPORATOR
+from solved import solved_rows
 from users_run import users_main
 
 from loopwright.pipeline.files import write_bytes
@@ -61,6 +64,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--picture", type=Path, help="file of a picture of the first plant's first day")
     parser.add_argument("--operating", action="store_true", help="priorities and bumps instead")
     parser.add_argument("--run", action="store_true", help="ours through `new` and `run` instead, beside the NMPC")
+    parser.add_argument("--solved", action="store_true", help="ours beside problems solved to their end instead")
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     fit = Fit(options.rows, options.minutes, options.networks)
@@ -70,6 +74,10 @@ def main(argv: list[str]) -> int:
 
         for name in options.plants or ("column", "furnace", "reactor"):
             print(operating_rows(PLANTS[name], fit), flush=True)
+        return 0
+    if options.solved:
+        for name in names:
+            print(solved_rows(PLANTS[name], fit, options.seeds, options.samples), flush=True)
         return 0
     if options.run:
         return users_main([PLANTS[n] for n in names], fit, options.seeds, options.samples, options.json)
