@@ -225,7 +225,7 @@ def _of_law(law: ControlLaw, given: Mapping[str, Array]) -> Iterator[Array]:
 
 
 def _nudged_by(law: ControlLaw, given: Mapping[str, Array], answers: Array) -> Array:
-    """How far the law's answers (steps, m) change at most, entry by entry, where all measured inputs round otherwise."""
+    """How far the law's answers (steps, m) change at most, entry by entry, where measured inputs round otherwise."""
     rng = np.random.default_rng(0)
     measured = [name for name in given if name not in ("operate", "fresh")]  # those are numbers that somebody sets
     nudged = {n: given[n] * (1.0 + NUDGE * rng.choice([-1.0, 1.0], given[n].shape)) for n in measured}
