@@ -86,7 +86,7 @@ static void asked(LAW_loop *l)
         }
     }
     if (one_in(40.0)) {
-        LAW_set_mode(l, one_in(3.0) ? CAP_MANUAL : CAP_AUTO);
+        LAW_set_mode(l, one_in(3.0) ? CAP_MANUAL : (one_in(3.0) ? CAP_SHADOW : CAP_AUTO));
     }
     if (one_in(50.0)) {
         LAW_gap(l, 6.0 * drawn());
@@ -186,6 +186,13 @@ int main(int argc, char **argv)
         s.age_s = one_in(50.0) ? about(-1.0, 3.0 * CAP_PERIOD_S, 3.0) : 0.0;
         writes = LAW_scan(&l, one_in(60.0) ? 0 : &s);
         looked_at(&l, writes, scan);
+        for (int k = 0; k < CAP_N_MV && l.mode == CAP_SHADOW; ++k) {
+            const int follows = l.why != CAP_NONE || !s.has_mv_applied || (l.mv[k] >= plant[k] && l.mv[k] <= plant[k]);
+            if (writes || !follows) {
+                printf("scan %ld: in SHADOW MV %d is %.17g, the plant's %.17g\n", scan, k, l.mv[k], plant[k]);
+                ++wrong;
+            }
+        }
         written += writes;
         held += l.held;
         if (writes && one_in(80.0)) {

@@ -60,6 +60,12 @@ static int may_move(int k, double applied, double value)
     return !(most > 0.0) || way <= most + MOVE_ROUNDING * (low > high ? low : high);
 }
 
+/* Whether it is known where the MV stands. */
+static int placed(const lower_loop *l)
+{
+    return l->known && !l->lost;
+}
+
 static void cold(lower_loop *l)
 {
     for (int i = 0; i < UPPER_N_STATE; ++i) {
@@ -302,14 +308,14 @@ static void take(lower_loop *l, const lower_sample *s)
     if (s == NULL || !good_one) {
         return;
     }
-    if (!s->has_mv_applied && !lower_writes(l)) {
+    if (!s->has_mv_applied && !placed(l)) {
         fail(l, UPPER_MV_NOT_KNOWN, 0);
         return;
     }
     for (k = 0; k < UPPER_N_MV; ++k) {
         const double stands = s->has_mv_applied ? s->mv_applied[k] : l->mv[k];
         l->applied[k] = inside(stands, UPPER_MV_LOW[k], UPPER_MV_HIGH[k]);
-        if (!lower_writes(l)) {
+        if (!placed(l) || l->mode == UPPER_SHADOW) {
             l->mv[k] = l->applied[k];
         }
     }
@@ -387,7 +393,7 @@ void lower_begin(lower_loop *l, lower_mode mode, long recover_after)
 
 int lower_writes(const lower_loop *l)
 {
-    return l->known && !l->lost;
+    return placed(l) && l->mode != UPPER_SHADOW;
 }
 
 int lower_set_sp(lower_loop *l, const double *sp)

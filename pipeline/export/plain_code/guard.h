@@ -10,8 +10,9 @@
 extern "C" {
 #endif
 
-/* The MV is the operator's, the law's, or the last one after a fault. */
-typedef enum { UPPER_MANUAL, UPPER_AUTO, UPPER_HOLD } lower_mode;
+/* The MV is the operator's, the law's, the last one after a fault, or others': in SHADOW nothing is written, l.mv follows
+   what is read back, and l.law is what the law would write. */
+typedef enum { UPPER_MANUAL, UPPER_AUTO, UPPER_HOLD, UPPER_SHADOW } lower_mode;
 
 /* Why a scan was not acted on; `which` is the place of the PV, DV or MV. */
 typedef enum {

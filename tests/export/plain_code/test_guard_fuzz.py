@@ -48,6 +48,7 @@ def test_random_histories_of_a_law_that_operators_steer(steered: Path, tmp_path:
     [
         ("size_of(way) > most)", "size_of(way) > 9.0 * most)"),  # an MV by hand as fast as it likes
         ("if (!mv_may_be(k, mv[k], 0.0))", "if (!mv_may_be(k, mv[k], 0.5))"),  # an MV by hand beyond its range
+        ("if (!placed(l) || ", "if (!placed(l) || 0 * (int)"),  # what others command is not followed
     ],
 )
 def test_a_guard_without_a_check_is_found(steered: Path, tmp_path: Path, old: str, new: str) -> None:

@@ -99,6 +99,23 @@ def test_scans_of_a_law_that_operators_steer(steered: tuple[Machine, Manifest, K
     assert wrong_scans(*steered) == []
 
 
+def test_in_shadow_nothing_is_written_and_auto_begins_where_the_mv_stands() -> None:
+    machine, m, _ = machine_of(FILES[0])
+    guard = machine.make("tank_guard")
+    given: dict[str, Any] = {"pv": [s.middle for s in m.pv], "has_mv_applied": True, "sample_read": True}
+    given |= {"dv": [s.middle for s in m.dv]} if "dv" in m.inputs else {}
+    for share in (0.4, 0.6, 0.7):
+        back = [s.low + share * (s.high - s.low) for s in m.mv]
+        guard(**given, mv_applied=back, mode_command=3)
+        assert guard.mode == 3
+        assert not guard.writes
+        assert list(guard.mv) == back
+    guard(**given | {"pv": [float("inf") for _ in m.pv]}, mv_applied=back, mode_command=1)
+    assert guard.mode == 2  # HOLD
+    assert guard.writes
+    assert list(guard.mv) == back
+
+
 def test_what_operators_may_not_change_is_refused(steered: tuple[Machine, Manifest, KitInC]) -> None:
     machine, m, _ = steered
     guard = machine.make("tank_guard")
