@@ -19,7 +19,7 @@ from onnx_graphs import Nodes, assert_equal, graph, n_nodes, narrow, results, se
 from shipped_files import SHIPPED
 
 from loopwright.pipeline.export import fusion
-from loopwright.pipeline.export.fusion import emission, fused, reading
+from loopwright.pipeline.export.fusion import emission, fused, lone_factors, reading
 from loopwright.pipeline.export.fusion.affine import Affine
 from loopwright.pipeline.export.fusion.items import Group, SelectionPool
 from loopwright.pipeline.export.fusion.plan import FormChoice, Item
@@ -189,14 +189,18 @@ def scaled_product(rng: np.random.Generator) -> onnx.ModelProto:
     )
 
 
-def test_no_factor_is_fused_into_a_float32_attribute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("least_saving", [-1.0, 1.0], ids=["fused", "as it is"])
+def test_no_factor_is_fused_into_a_float32_attribute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, least_saving: float
+) -> None:
     model = scaled_product(np.random.default_rng(0))
     assert narrow(model, tmp_path) == ["FusedMatMul", "FusedMatMul"]  # what the guard is for
-    monkeypatch.setattr(fusion, "LEAST_SAVING", -1.0)
+    monkeypatch.setattr(fusion, "LEAST_SAVING", least_saving)
     made = fused(model)
     assert narrow(made, tmp_path) == []
     assert_factors_exact(model, made)
-    monkeypatch.setattr(emission._Writer, "_apart", lambda writer: writer.nodes)
+    for home in (emission, lone_factors):
+        monkeypatch.setattr(home, "apart", lambda nodes, *_: list(nodes))
     assert narrow(fused(model), tmp_path)
 
 

@@ -9,6 +9,7 @@ from loopwright.pipeline.export.fusion.emission import Outputs, emitted
 from loopwright.pipeline.export.fusion.forms import forms_of
 from loopwright.pipeline.export.fusion.items import Items
 from loopwright.pipeline.export.fusion.joining import joined
+from loopwright.pipeline.export.fusion.lone_factors import with_factors_apart
 from loopwright.pipeline.export.fusion.plan import Item
 from loopwright.pipeline.export.fusion.reading import GraphReading
 
@@ -17,7 +18,7 @@ LEAST_SAVING = 0.002
 
 
 def fused(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The same function with fewer operators; the model itself where nothing is gained.
+    """The same function with fewer operators; as it is, but for factors of one element, where nothing is gained.
 
     Values that are affine in the inputs and in the results of nonlinear operators are computed by few products, never
     by one that is dearer than what it replaces. Equal to the given graph but for the rounding. The graph must have
@@ -35,7 +36,7 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
                 break
     after, items, outputs, _ = min(candidates, key=lambda c: c[0])
     if after > (1 - LEAST_SAVING) * candidates[0][3].price_before:
-        return model
+        return with_factors_apart(model)
     return emitted(items, outputs, model)
 
 

@@ -12,6 +12,7 @@ from onnx import helper, numpy_helper
 
 from loopwright.pipeline.export.fusion.affine import Array, Attributes, Shape, numbers
 from loopwright.pipeline.export.fusion.items import Group, Items, SelectionPool
+from loopwright.pipeline.export.fusion.lone_factors import apart
 from loopwright.pipeline.export.fusion.plan import (
     FormChoice,
     GraphInput,
@@ -57,7 +58,7 @@ class _Writer:
         for name, item in self.outputs:
             if self._name(item) != name:
                 self.nodes.append(helper.make_node("Identity", [self._name(item)], [name]))
-        nodes = self._apart()
+        nodes = apart(self.nodes, dict(self.constants.values()), self.shapes, self._constant)
         used = {name for node in nodes for name in node.input}
         made = onnx.ModelProto()
         made.CopyFrom(self.source)
@@ -215,35 +216,6 @@ class _Writer:
 
     def _raw(self, op: str, inputs: list[str], attributes: Attributes, outputs: list[str]) -> None:
         self.nodes.append(helper.make_node(op, inputs, outputs, **attributes))
-
-    def _apart(self) -> list[onnx.NodeProto]:
-        """The nodes, with no constant of one element beside a MatMul: onnxruntime would fuse the two in float32.
-
-        Its FusedMatMul has a factor ``alpha``, which is a float32 attribute. A factor of several
-        elements is written out for each; a factor of one element becomes a product with a 1 x 1 matrix.
-        """
-        products = {n.output[0] for n in self.nodes if n.op_type == "MatMul"}
-        multiplied = {name for n in self.nodes if n.op_type == "MatMul" for name in n.input}
-        values = dict(self.constants.values())
-        found = []
-        for node in self.nodes:
-            beside = node.op_type in ("Mul", "Div") and bool(
-                node.output[0] in multiplied or products.intersection(node.input)
-            )
-            places = [i for i, name in enumerate(node.input) if name in values and values[name].size == 1]
-            shape = self.shapes.get(node.output[0], ())
-            if not beside or not places or (node.op_type == "Div" and places == [0]) or shape == ():
-                found.append(node)
-                continue
-            name, factor = node.input[1 - places[0]], values[node.input[places[0]]].reshape(())
-            if prod(shape) > 1:
-                inputs = [name, name]
-                inputs[places[0]] = self._constant(np.full(shape, factor))
-                found.append(helper.make_node(node.op_type, inputs, node.output))
-            else:
-                factor = 1 / factor if node.op_type == "Div" else factor
-                found.append(helper.make_node("MatMul", [name, self._constant(np.array([[factor]]))], node.output))
-        return found
 
 
 def _chosen(item: Item) -> Item:
