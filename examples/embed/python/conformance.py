@@ -56,6 +56,7 @@ for run in differences:
 
 begin, scans, before = vectors["loop"], [], None
 setting = {name: begin[name] for name in ("recover_after", "max_gap")}
+setting["learns"] = False  # one step a scan, as hosts in other languages do
 loop = ControlLoop(controller, sp=numbers(begin["sp"]), mv=numbers(begin["mv"]), mode=Mode.AUTO, **setting)
 for row in vectors["scans"]:
     if row["set_mode"]:
