@@ -1,4 +1,4 @@
-"""The closed circle: a loop on a served plant, its journal as data, a controller of these data in that loop.
+"""The closed circle: a sluggish PI on a served plant, its journal as data, a controller of these data in its place.
 
 ``python tests/closed_circle.py record FOLDER [CASE]`` runs a loop and exports its journal; then `loopwright new` and
 `loopwright run` make a controller of it; ``python tests/closed_circle.py swap FOLDER CONTROLLER [CASE]`` swaps it in.
@@ -16,9 +16,10 @@ from plant_servers import Plant, RunningLoop
 from processes import within
 
 from loopwright.pipeline.__main__ import main
+from loopwright.pipeline.cases import PLANTS
+from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws.pid.pid import PID
 from loopwright.serving.station.control import ask
-
-LAW = "pid"
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class Circle:
 
     case: str
     sp: str
+    kc: float  # [mv/pv] of the PI before: a third of a good one, so that chance does not decide whether the new one is
+    ti_s: float  # better than it
     speed: float
     max_age_s: tuple[float, float]  # as written, as a plant that runs so fast needs it
     rows: int
@@ -39,25 +42,34 @@ class Circle:
 CIRCLES = {
     # A period of 60 s in 50 ms.
     "ph_neutralization": Circle(
-        "ph_neutralization", "pH", 1200.0, (90, 1200), 1_500, (6.6, 8.8), (5, 40), (7.2, 7.6), 0.15
+        "ph_neutralization", "pH", 14.0, 180.0, 1200.0, (90, 1200), 1_500, (6.6, 8.8), (5, 40), (7.2, 7.6), 0.15
     ),
     # A second PV is measured, and is in the journal. A period of 2 s in 67 ms.
     "reversible_cstr": Circle(
-        "reversible_cstr", "C_B", 30.0, (3, 60), 3_000, (0.35, 0.54), (15, 120), (0.40, 0.48), 0.01
+        "reversible_cstr", "C_B", -1.0, 12.0, 30.0, (3, 60), 3_000, (0.35, 0.54), (15, 120), (0.40, 0.48), 0.01
     ),
 }
 
 
+def pi_of(circle: Circle) -> PID:
+    """The PI that ran the plant before."""
+    simulated = PLANTS[circle.case]()
+    return PID.design(PID.Params(tuning="manual", kc=circle.kc, ti_s=circle.ti_s), {}, simulated.signals, simulated)
+
+
 def begun(folder: Path, circle: Circle) -> tuple[Plant, RunningLoop]:
     """The plant and its loop, in AUTO."""
+    folder = folder.absolute()  # the plant's process has a folder of its own
     folder.mkdir(parents=True, exist_ok=True)
     plant = Plant(folder, circle.case, circle.speed, "--noise")
     plant.start()
     path = folder / "loop.toml"
     path.unlink(missing_ok=True)
-    file = Path("artifacts", circle.case, f"{LAW}.onnx")
+    file = folder / "pi.onnx"
+    export(pi_of(circle), file, case=circle.case, provenance={})
     assert main(["loop", "init", str(file), "--endpoint", plant.endpoint, "--out", str(path)]) == 0
-    text = path.read_text().replace('page = "127.0.0.1:8080"', f"speed = {circle.speed}").replace("SHADOW", "AUTO", 1)
+    settings = f"speed = {circle.speed}\naccept_unproven = true"  # no closed loop proved the PI
+    text = path.read_text().replace('page = "127.0.0.1:8080"', settings).replace("SHADOW", "AUTO", 1)
     written, patient = (f"max_age_s = {age:g}" for age in circle.max_age_s)
     assert written in text
     path.write_text(text.replace(written, patient))
