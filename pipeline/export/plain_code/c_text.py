@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from loopwright.pipeline.export.plain_code.layout import EXTREMES, INFIX, OWN, WIDTH, PrintedLayout
+from loopwright.pipeline.export.plain_code.layout import (
+    COUNTERS,
+    EXTREMES,
+    INFIX,
+    OWN,
+    ROUND_COUNTERS,
+    WIDTH,
+    PrintedLayout,
+    terms_of,
+)
+from loopwright.pipeline.export.plain_code.memory import WORK
 from loopwright.pipeline.export.plain_code.printed_functions import functions_in_c, number
+from loopwright.pipeline.export.plain_code.rounds import Block
 from loopwright.pipeline.export.plain_code.statements import Floats, Place, Places, PlainProgram, PlainStatement
 
+SUMS = 4  # of products side by side: an addition waits 3 to 4 cycles for the one before it, and its sums fit registers
+_DEEPER = "    "
 _COMPARED = {"less": "<", "less_equal": "<=", "greater": ">", "greater_equal": ">=", "equal": "=="}
+_WITHOUT_CALL = {*_COMPARED, "neg", "not", "and", "or", "where"}
 # Bodies of the small functions, by operation: parameters, result.
 _SMALL = {
     "abs": ("double a", "a < 0.0 ? -a : a"),
@@ -38,7 +52,7 @@ def printed_step(program: PlainProgram, name: str) -> PrintedStep:
     the compiler keeps to what ``Makefile`` says (``-ffp-contract=off``).
     """
     layout = PrintedLayout.of(program)
-    program, memory, own, used = layout.program, layout.memory, layout.own_functions(), layout.operations
+    own, used = layout.own_functions(), layout.operations
     printer = _Printer(layout)
     small = [
         f"static double plain_{op}({given})\n{{\n    return {result};\n}}\n"
@@ -55,16 +69,17 @@ def printed_step(program: PlainProgram, name: str) -> PrintedStep:
         "",
         declaration,
         "{",
-        *([f"    double w[{memory.size}];"] if memory.size else []),
-        *(line for s in program.statements for line in printer.statement(s)),
+        *([f"    double {WORK}[{layout.work_entries}];"] if layout.work_entries else []),
+        *(line for b in layout.blocks for line in printer.block(b, "    ")),
         "}",
     ]
-    return PrintedStep(declaration, "\n".join(lines) + "\n", 8 * memory.size, printer.table_bytes(), program.operations)
+    text = "\n".join(lines) + "\n"
+    return PrintedStep(declaration, text, 8 * layout.work_entries, printer.table_bytes(), layout.program.operations)
 
 
 class _Printer:
     def __init__(self, layout: PrintedLayout) -> None:
-        self.layout, self.program, self.memory = layout, layout.program, layout.memory
+        self.layout, self.program = layout, layout.program
 
     def tables(self) -> Iterator[str]:
         for name, values in self.layout.kept():
@@ -75,59 +90,120 @@ class _Printer:
     def table_bytes(self) -> int:
         return sum(8 * len(v) for _, v in self.layout.kept()) + sum(2 * len(t) for t in self.program.tables.values())
 
-    def statement(self, s: PlainStatement) -> Iterator[str]:
-        indent, outer = "    ", len(s.loops) - s.summed
-        for d in range(outer):
-            yield f"{indent}{_loop(d, s.loops[d])}"
-            indent += "    "
-        target = self.entry(s.target)
-        if not s.summed:
-            yield f"{indent}{target} = {_value(s.op, [self.entry(p) for p in s.args])};"
+    def block(self, block: Block, indent: str, around: int = 0) -> Iterator[str]:
+        """Rounds within ``around`` others, or a statement."""
+        if isinstance(block, PlainStatement):
+            yield from self.statement(block, indent)
+            return
+        yield f"{indent}{_loop(ROUND_COUNTERS[around], block.times)}"
+        for inner in block.blocks:
+            yield from self.block(inner, indent + _DEEPER, around + 1)
+        yield f"{indent}}}"
+
+    def statement(self, s: PlainStatement, indent: str) -> Iterator[str]:
+        beside = s.op == "dot" and bool(s.outer)
+        loops = s.outer[:-1] if beside else s.outer
+        for d, count in enumerate(loops):
+            yield f"{indent}{_loop(COUNTERS[d], count)}"
+            indent += _DEEPER
+        if beside:
+            yield from self.side_by_side(s, indent)
+        elif s.summed:
+            yield from self.together(s, indent)
         else:
-            yield from self._together(s, target, indent, outer)
-        for _ in range(outer):
-            indent = indent[:-4]
+            value = _value(s.op, [self.entry(p) for p in s.args])
+            yield f"{indent}{self.entry(s.target)} = {self.then(s, value, s.op)};"
+        for _ in loops:
+            indent = indent.removesuffix(_DEEPER)
             yield f"{indent}}}"
 
-    def _together(self, s: PlainStatement, target: str, indent: str, outer: int) -> Iterator[str]:
-        extreme = EXTREMES.get(s.op)
-        args = [self.entry(p) for p in s.args]
-        if not outer:
+    def side_by_side(self, s: PlainStatement, indent: str) -> Iterator[str]:
+        """The last outer loop some rounds at a time: a processor adds to one sum while it waits for the others."""
+        d, count = len(s.outer) - 1, s.outer[-1]
+        whole = count - count % SUMS
+        if whole > SUMS:
+            yield f"{indent}for (int {COUNTERS[d]} = 0; {COUNTERS[d]} < {whole}; {COUNTERS[d]} += {SUMS}) {{"
+            yield from self.products([_shifted(s, d, m) for m in range(SUMS)], indent + _DEEPER)
+            yield f"{indent}}}"
+        for first in range(0 if whole == SUMS else whole, count, SUMS):
             yield f"{indent}{{"
-            indent += "    "
-        if extreme:
-            yield f"{indent}double s = {self.entry(s.args[0], outer)};"
-        else:
-            yield f"{indent}double s = 0.0;"
+            lanes = range(first, min(first + SUMS, count))
+            yield from self.products([_shifted(s, d, m, alone=True) for m in lanes], indent + _DEEPER)
+            yield f"{indent}}}"
+
+    def products(self, lanes: Sequence[PlainStatement], indent: str) -> Iterator[str]:
+        """Sums of products beside each other, each in its own order."""
+        s = lanes[0]
+        names = [f"s{m}" for m in range(len(lanes))] if len(lanes) > 1 else ["s"]
+        yield f"{indent}double {', '.join(f'{name} = 0.0' for name in names)};"
         at = indent
-        for d in range(outer, len(s.loops)):
-            yield f"{at}{_loop(d, s.loops[d])}"
-            at += "    "
+        for d in range(len(s.outer), len(s.loops)):
+            yield f"{at}{_loop(COUNTERS[d], s.loops[d])}"
+            at += _DEEPER
+        for name, lane in zip(names, lanes, strict=True):
+            yield f"{at}{name} += {self.entry(lane.args[0])} * {self.entry(lane.args[1])};"
+        for _ in range(len(s.outer), len(s.loops)):
+            at = at.removesuffix(_DEEPER)
+            yield f"{at}}}"
+        for name, lane in zip(names, lanes, strict=True):
+            yield f"{indent}{self.entry(lane.target)} = {self.finished(lane, name)};"
+
+    def together(self, s: PlainStatement, indent: str) -> Iterator[str]:
+        """A sum or an extreme over the summed loops."""
+        if not s.outer:
+            yield f"{indent}{{"
+            indent += _DEEPER
+        extreme, args = EXTREMES.get(s.op), [self.entry(p) for p in s.args]
+        yield f"{indent}double s = {self.entry(s.args[0], len(s.outer)) if extreme else '0.0'};"
+        at = indent
+        for d in range(len(s.outer), len(s.loops)):
+            yield f"{at}{_loop(COUNTERS[d], s.loops[d])}"
+            at += _DEEPER
         if extreme:
             yield f"{at}s = plain_{extreme}(s, {args[0]});"
         else:
             yield f"{at}s += {args[0]}{' * ' + args[0 if s.op == 'sum_squares' else 1] if s.op != 'sum' else ''};"
-        for _ in range(outer, len(s.loops)):
-            at = at[:-4]
+        for _ in range(len(s.outer), len(s.loops)):
+            at = at.removesuffix(_DEEPER)
             yield f"{at}}}"
-        added = args[2:] if s.op == "dot" else args[1:] if s.op == "sum" else []
-        yield f"{indent}{target} = {' + '.join(['s', *added])};"
-        if not outer:
-            yield f"{indent[:-4]}}}"
+        yield f"{indent}{self.entry(s.target)} = {self.finished(s, 's')};"
+        if not s.outer:
+            yield f"{indent.removesuffix(_DEEPER)}}}"
+
+    def finished(self, s: PlainStatement, name: str) -> str:
+        """What is written of the sum or extreme of that name."""
+        added = s.args[2:] if s.op == "dot" else s.args[1:] if s.op == "sum" else ()
+        value = " + ".join([name, *map(self.entry, added)])
+        return self.then(s, value, "add" if added else "")
+
+    def then(self, s: PlainStatement, value: str, op: str) -> str:
+        """``value``, which ``op`` made, after what is done with it."""
+        for after in s.then:
+            if op in INFIX or op in _WITHOUT_CALL:
+                value = f"({value})"
+            others = [self.entry(p) for p in after.args]
+            value, op = _value(after.op, [*others[: after.at], value, *others[after.at :]]), after.op
+        return value
 
     def entry(self, place: Place, loops: int | None = None) -> str:
         """Where a place is; with ``loops`` only those counters run, the others stand at 0."""
         values = self.program.constants.get(place.buffer)
         if values is not None and len(values) == 1:
             return number(float(values[0])) if values[0] >= 0 else f"({number(float(values[0]))})"
-        start = self.memory.starts.get(place.buffer, 0)
-        terms = [f"{s} * {_counter(d)}" if s != 1 else _counter(d) for d, s in enumerate(place.strides[:loops]) if s]
-        name = "w" if place.buffer in self.memory.starts else self.layout.name(place.buffer)
-        if place.table:
-            inner = " + ".join([*terms, *([str(place.offset)] if place.offset or not terms else [])])
-            return f"{name}[{f'{start} + ' if start else ''}{place.table}[{inner}]]"
-        offset = start + place.offset
-        return f"{name}[{' + '.join([*([str(offset)] if offset or not terms else []), *terms])}]"
+        terms = terms_of(place, loops)
+        name = self.layout.name(place.buffer)
+        at = " + ".join([*([str(place.offset)] if place.offset or not terms else []), *terms])
+        return f"{name}[{place.table}[{at}]]" if place.table else f"{name}[{at}]"
+
+
+def _shifted(s: PlainStatement, d: int, by: int, *, alone: bool = False) -> PlainStatement:
+    """The same some rounds of loop ``d`` later; ``alone``, outside that loop."""
+
+    def moved(p: Place) -> Place:
+        strides = (*p.strides[:d], 0, *p.strides[d + 1 :]) if alone else p.strides
+        return replace(p, offset=p.offset + by * p.strides[d], strides=strides)
+
+    return s.at_places(moved)
 
 
 def _value(op: str, args: Sequence[str]) -> str:
@@ -154,9 +230,8 @@ def _counter(depth: int) -> str:
     return "ijklmn"[depth]
 
 
-def _loop(depth: int, count: int) -> str:
-    i = _counter(depth)
-    return f"for (int {i} = 0; {i} < {count}; ++{i}) {{"
+def _loop(counter: str, count: int) -> str:
+    return f"for (int {counter} = 0; {counter} < {count}; ++{counter}) {{"
 
 
 def _numbers(kind: str, name: str, values: Floats | Places) -> str:

@@ -62,7 +62,7 @@ _MEANING: dict[str, Callable[..., Floats]] = {
 def run_statement(statement: PlainStatement, arrays: Mapping[str, Floats], tables: Mapping[str, Places]) -> None:
     """Do one statement on ``arrays`` (..., n), in place: in each of many steps side by side, if there are such."""
     s = statement
-    outer, inner = s.loops[: len(s.loops) - s.summed], s.loops[len(s.loops) - s.summed :]
+    outer, inner = s.outer, s.loops[len(s.outer) :]
     rows = _counters(outer)
 
     def entries(place: Place, fixed: tuple[int, ...]) -> Places:
@@ -87,6 +87,9 @@ def run_statement(statement: PlainStatement, arrays: Mapping[str, Floats], table
             added = s.args[2:] if s.op == "dot" else s.args[1:]
             if added:
                 result = result + read(added[0], zero)
+    for after in s.then:
+        args = [read(p, zero) for p in after.args]
+        result = _MEANING[after.op](*args[: after.at], result, *args[after.at :])
     arrays[s.target.buffer][..., entries(s.target, zero)] = result
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from loopwright.pipeline.export.plain_code.memory import WorkMemory, laid_out, without_copies
-from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, PlainProgram
+from loopwright.pipeline.export.plain_code.fusing import fused
+from loopwright.pipeline.export.plain_code.memory import WORK, in_one_memory, laid_out, without_copies
+from loopwright.pipeline.export.plain_code.rounds import Block, in_rounds
+from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, PlainProgram
 
 WIDTH = 100  # characters of a line of numbers
+COUNTERS, ROUND_COUNTERS = "ijklmn", "rqp"  # of loops and of rounds, outer ones first
 EXTREMES: Mapping[str, str] = {"largest": "max", "least": "min"}
 OWN: Mapping[str, str] = {"exp": "plain_exp", "log": "plain_log", "tanh": "plain_tanh"}
 INFIX: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
@@ -16,24 +19,32 @@ INFIX: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
 @dataclass(frozen=True, slots=True)
 class PrintedLayout:
-    """Shared by both texts: the program, where its arrays lie, and the names of its constants."""
+    """Shared by both texts: the program in one working memory, its blocks, and the names of its constants."""
 
-    program: PlainProgram
-    memory: WorkMemory
+    program: PlainProgram  # its own arrays are one, WORK
+    blocks: tuple[Block, ...]  # its statements, repeated ones once
     names: Mapping[str, str]  # of constants, the first of equal ones
 
     @classmethod
     def of(cls, program: PlainProgram) -> PrintedLayout:
-        """The layout of ``program``, results made where they are copied to."""
-        program = without_copies(program)
+        """The layout of ``program``, results made where they are copied to and used at once where they can be."""
+        program = fused(without_copies(program))
         seen: dict[bytes, str] = {}
         names = {name: seen.setdefault(values.tobytes(), name) for name, values in program.constants.items()}
-        return cls(program, laid_out(program), names)
+        program = in_one_memory(program, laid_out(program))
+        named = [s.at_places(lambda p: replace(p, buffer=names.get(p.buffer, p.buffer))) for s in program.statements]
+        return cls(program, in_rounds(named), names)
+
+    @property
+    def work_entries(self) -> int:
+        """Entries of the working memory."""
+        return self.program.arrays.get(WORK, 0)
 
     @property
     def operations(self) -> frozenset[str]:
         """Kinds of operation that are printed."""
-        return frozenset(EXTREMES.get(s.op, s.op) for s in self.program.statements)
+        used = [op for s in self.program.statements for op in (s.op, *(t.op for t in s.then))]
+        return frozenset(EXTREMES.get(op, op) for op in used)
 
     def own_functions(self) -> list[str]:
         """Names in ``elementary`` of the functions that are used."""
@@ -49,3 +60,9 @@ class PrintedLayout:
         for name, values in self.program.constants.items():
             if len(values) > 1 and self.names[name] == name:
                 yield name, values
+
+
+def terms_of(place: Place, loops: int | None = None, prefix: str = "") -> list[str]:
+    """What the counters of rounds and of the first ``loops`` loops, or of all, add to a place's offset."""
+    steps = [*zip(place.further, ROUND_COUNTERS, strict=False), *zip(place.strides[:loops], COUNTERS, strict=False)]
+    return [f"{n} * {prefix}{name}" if n != 1 else f"{prefix}{name}" for n, name in steps if n]

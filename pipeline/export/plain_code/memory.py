@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Final
 
 from loopwright.pipeline.export.plain_code.statements import Place, PlainProgram
+
+WORK: Final = "w"  # the one array of a program in one memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,7 @@ def without_copies(program: PlainProgram) -> PlainProgram:
             moved[read.buffer] = (s.target.buffer, s.target.offset)
     kept = []
     for s in statements:
-        changed = replace(s, target=found(s.target), args=tuple(found(p) for p in s.args))
+        changed = s.at_places(found)
         if changed.op != "copy" or changed.target != changed.args[0]:
             kept.append(changed)
     arrays = {name: n for name, n in program.arrays.items() if name not in moved}
@@ -47,14 +50,14 @@ def without_copies(program: PlainProgram) -> PlainProgram:
 
 
 def _by_table(program: PlainProgram, buffer: str) -> bool:
-    return any(p.table and p.buffer == buffer for s in program.statements for p in s.args)
+    return any(p.table and p.buffer == buffer for s in program.statements for p in s.read)
 
 
 def lives(program: PlainProgram) -> dict[str, tuple[int, int]]:
     """The statements from the first that writes an array to the last that reads it."""
     found: dict[str, tuple[int, int]] = {}
     for k, s in enumerate(program.statements):
-        for place in (s.target, *s.args):
+        for place in s.places:
             if place.buffer in program.arrays:
                 found[place.buffer] = (found.get(place.buffer, (k, k))[0], k)
     return found
@@ -77,6 +80,24 @@ def laid_out(program: PlainProgram) -> WorkMemory:
         starts[name] = start
     size = max((start + program.arrays[name] for name, start in starts.items()), default=0)
     return WorkMemory(starts, size)
+
+
+def in_one_memory(program: PlainProgram, memory: WorkMemory) -> PlainProgram:
+    """The same with one array of its own, in which the others lie."""
+    tables = dict(program.tables)
+
+    def found(place: Place) -> Place:
+        start = memory.starts.get(place.buffer)
+        if start is None:
+            return place
+        if not place.table:
+            return replace(place, buffer=WORK, offset=start + place.offset)
+        tables[place.table] = program.tables[place.table] + start
+        return replace(place, buffer=WORK)
+
+    statements = tuple(s.at_places(found) for s in program.statements)
+    arrays = {WORK: memory.size} if memory.size else {}
+    return replace(program, arrays=arrays, statements=statements, tables=tables)
 
 
 def overlaps(program: PlainProgram, memory: WorkMemory) -> list[tuple[str, str]]:

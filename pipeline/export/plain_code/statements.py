@@ -13,7 +13,7 @@ Truth is a double, too: 1 or 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import prod
 from typing import Final
@@ -41,12 +41,16 @@ TOGETHER: Final[Mapping[str, tuple[int, ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Entry ``offset + sum strides_d i_d`` of an array, or, with a ``table``, the entry that the table has there."""
+    """Entry ``offset + sum strides_d i_d`` of an array, or, with a ``table``, the entry that the table has there.
+
+    In rounds (``rounds.Rounds``) it lies ``further`` entries on with each round of those around it.
+    """
 
     buffer: str
     offset: int
     strides: tuple[int, ...]  # one a loop
     table: str = ""
+    further: tuple[int, ...] = ()  # one for each of the rounds around it, outer ones first
 
     def at(self, counters: Places) -> Places:
         """The entries (n,) for counters (n, loops); of the table where there is one."""
@@ -55,28 +59,67 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
+class Then:
+    """An operation on a result at once: its argument ``at`` is the result, the others are ``args``."""
+
+    op: str
+    args: tuple[Place, ...]  # as many strides as the statement has loops; 0 in the summed ones
+    at: int = 0
+
+    def __post_init__(self) -> None:
+        assert len(self.args) + 1 == ELEMENTWISE[self.op]
+        assert 0 <= self.at <= len(self.args)
+
+
+@dataclass(frozen=True, slots=True)
 class PlainStatement:
-    """One nest of loops: ``loops`` counts, outer ones first, of which the last ``summed`` are put together."""
+    """One nest of loops: ``loops`` counts, outer ones first, of which the last ``summed`` are put together.
+
+    What ``then`` says is done with the result, one operation after the other, before it is written.
+    """
 
     op: str
     target: Place  # its strides in the summed loops are 0
     args: tuple[Place, ...]
     loops: tuple[int, ...]
     summed: int = 0
+    then: tuple[Then, ...] = ()
 
     def __post_init__(self) -> None:
         counts = TOGETHER.get(self.op) or (ELEMENTWISE[self.op],)
         assert len(self.args) in counts, f"{self.op} of {len(self.args)}"
         assert (self.op in TOGETHER) == (self.summed > 0), f"{self.op} with {self.summed} summed loops"
-        assert all(len(p.strides) == len(self.loops) for p in (self.target, *self.args))
+        assert all(len(p.strides) == len(self.loops) for p in self.places)
+
+    @property
+    def outer(self) -> tuple[int, ...]:
+        """The loops that are not put together: over the entries that it writes."""
+        return self.loops[: len(self.loops) - self.summed]
+
+    @property
+    def read(self) -> tuple[Place, ...]:
+        """All that it reads."""
+        return (*self.args, *(p for t in self.then for p in t.args))
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """What it writes, and all that it reads."""
+        return (self.target, *self.read)
 
     @property
     def operations(self) -> int:
-        """How often its operation is done."""
-        return prod(self.loops)
+        """How often an operation is done."""
+        return prod(self.loops) + len(self.then) * prod(self.outer)
+
+    def at_places(self, change: Callable[[Place], Place]) -> PlainStatement:
+        """The same at other places, changed in the order of ``places``."""
+        target, args = change(self.target), tuple(map(change, self.args))
+        then = tuple(replace(t, args=tuple(map(change, t.args))) for t in self.then)
+        return replace(self, target=target, args=args, then=then)
 
     def simplified(self) -> PlainStatement:
         """The same without loops of one round, and with loops in one that run through entries in the same order."""
+        assert not self.then
         kept = [d for d, n in enumerate(self.loops) if n != 1]
         outer = len([d for d in kept if d < len(self.loops) - self.summed])
         loops = [self.loops[d] for d in kept]

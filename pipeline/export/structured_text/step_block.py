@@ -5,12 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from loopwright.pipeline.export.plain_code.layout import EXTREMES, INFIX, OWN, PrintedLayout
+from loopwright.pipeline.export.plain_code.layout import (
+    COUNTERS,
+    EXTREMES,
+    INFIX,
+    OWN,
+    ROUND_COUNTERS,
+    PrintedLayout,
+    terms_of,
+)
+from loopwright.pipeline.export.plain_code.memory import WORK
+from loopwright.pipeline.export.plain_code.rounds import Block, Rounds
 from loopwright.pipeline.export.plain_code.statements import Place, PlainProgram, PlainStatement
 from loopwright.pipeline.export.structured_text.elementary_functions import function_name
 from loopwright.pipeline.export.structured_text.iec_names import array_of, typed
 
 _COMPARED = {"less": "<", "less_equal": "<=", "greater": ">", "greater_equal": ">=", "equal": "="}
+_ROUND = [f"at_{name}" for name in ROUND_COUNTERS]
 _ONE, _ZERO = typed(1.0), typed(0.0)
 
 
@@ -34,7 +45,7 @@ def printed_step_block(program: PlainProgram, name: str) -> StepBlock:
     """
     layout = PrintedLayout.of(program)
     printer = _Printer(layout, name)
-    body = [line for s in layout.program.statements for line in printer.statement(s)]
+    body = [line for b in layout.blocks for line in printer.block(b)]
     n_state = program.inputs.get("state", 0)
     inputs = tuple(n for n, count in program.inputs.items() if count and n != "state")
     outputs = {layout.name(n): count for n, count in program.outputs.items() if count}
@@ -61,7 +72,7 @@ def printed_step_block(program: PlainProgram, name: str) -> StepBlock:
     ]
     table_bytes = sum(8 * len(v) for _, v in layout.kept()) + sum(4 * len(t) for t in program.tables.values())
     own_functions = tuple(layout.own_functions())
-    return StepBlock("\n".join(lines), layout.program, inputs, own_functions, 8 * layout.memory.size, table_bytes)
+    return StepBlock("\n".join(lines), layout.program, inputs, own_functions, 8 * layout.work_entries, table_bytes)
 
 
 class _Printer:
@@ -70,13 +81,15 @@ class _Printer:
         self.depth = max((len(s.loops) for s in layout.program.statements), default=0)
 
     def variables(self) -> Iterator[tuple[str, str]]:
-        if self.layout.memory.size:
-            yield "work", _array(self.layout.memory.size)
+        if self.layout.work_entries:
+            yield "work", _array(self.layout.work_entries)
         yield "total", "LREAL"
         for k in range(3):
             yield f"given_{k}", "LREAL"
         for d in range(self.depth):
             yield _counter(d), "DINT"
+        for d in range(max(map(_rounds, self.layout.blocks), default=0)):
+            yield _ROUND[d], "DINT"
 
     def tables(self) -> Iterator[str]:
         for name, values in self.layout.kept():
@@ -84,18 +97,31 @@ class _Printer:
         for name, places in self.layout.program.tables.items():
             yield f"    {_table(name)} : {array_of('DINT', places.tolist())};"
 
+    def block(self, block: Block, around: int = 0) -> Iterator[str]:
+        """Rounds within ``around`` others, or a statement."""
+        if isinstance(block, PlainStatement):
+            yield from self.statement(block)
+            return
+        yield _loop(_ROUND[around], block.times)
+        for inner in block.blocks:
+            for line in self.block(inner, around + 1):
+                yield f"    {line}"
+        yield "END_FOR;"
+
     def statement(self, s: PlainStatement) -> Iterator[str]:
-        indent, outer = "", len(s.loops) - s.summed
-        for d in range(outer):
-            yield f"{indent}{_loop(d, s.loops[d])}"
+        indent = ""
+        for d, count in enumerate(s.outer):
+            yield f"{indent}{_loop(_counter(d), count)}"
             indent += "    "
-        target = self.entry(s.target)
-        lines = (
-            self.together(s, target, outer) if s.summed else self.each(s.op, target, [self.entry(p) for p in s.args])
-        )
+        made = "total" if s.then else self.entry(s.target)
+        lines = list(self.together(s, made) if s.summed else self.each(s.op, made, [self.entry(p) for p in s.args]))
+        for k, after in enumerate(s.then, 1):
+            args = [self.entry(p) for p in after.args]
+            made = "total" if k < len(s.then) else self.entry(s.target)
+            lines += self.each(after.op, made, [*args[: after.at], "total", *args[after.at :]])
         for line in lines:
             yield f"{indent}{line}"
-        for _ in range(outer):
+        for _ in s.outer:
             indent = indent[:-4]
             yield f"{indent}END_FOR;"
 
@@ -124,14 +150,14 @@ class _Printer:
                 yield f"{named[k]} := {arg};"
             yield from _chosen(target, *_of_named(op, named))
 
-    def together(self, s: PlainStatement, target: str, outer: int) -> Iterator[str]:
+    def together(self, s: PlainStatement, target: str) -> Iterator[str]:
         """A sum, a product or an extreme over the summed loops."""
-        extreme = EXTREMES.get(s.op)
+        extreme, outer = EXTREMES.get(s.op), len(s.outer)
         args = [self.entry(p) for p in s.args]
         yield f"total := {self.entry(s.args[0], outer) if extreme else _ZERO};"
         indent = ""
         for d in range(outer, len(s.loops)):
-            yield f"{indent}{_loop(d, s.loops[d])}"
+            yield f"{indent}{_loop(_counter(d), s.loops[d])}"
             indent += "    "
         if extreme:
             yield f"{indent}given_0 := {args[0]};"
@@ -152,14 +178,11 @@ class _Printer:
         values = self.layout.program.constants.get(place.buffer)
         if values is not None and len(values) == 1:
             return typed(float(values[0]))
-        start = self.layout.memory.starts.get(place.buffer)
-        terms = [f"{s} * {_counter(d)}" if s != 1 else _counter(d) for d, s in enumerate(place.strides[:loops]) if s]
-        name = self.layout.name(place.buffer) if start is None else "work"
+        terms = terms_of(place, loops, "at_")
+        name = "work" if place.buffer == WORK else self.layout.name(place.buffer)
         name = _table(name) if values is not None else name
-        if place.table:
-            inner = _table(place.table) + f"[{_sum(place.offset, terms)}]"
-            return f"{name}[{_sum(start or 0, [inner])}]"
-        return f"{name}[{_sum((start or 0) + place.offset, terms)}]"
+        at = _sum(place.offset, terms)
+        return f"{name}[{_table(place.table)}[{at}]]" if place.table else f"{name}[{at}]"
 
 
 def _of_named(op: str, x: Sequence[str]) -> tuple[list[tuple[str, str]], str]:
@@ -196,8 +219,13 @@ def _table(name: str) -> str:
 
 
 def _counter(depth: int) -> str:
-    return f"at_{'ijklmn'[depth]}"
+    return f"at_{COUNTERS[depth]}"
 
 
-def _loop(depth: int, count: int) -> str:
-    return f"FOR {_counter(depth)} := 0 TO {count - 1} DO"
+def _loop(counter: str, count: int) -> str:
+    return f"FOR {counter} := 0 TO {count - 1} DO"
+
+
+def _rounds(block: Block) -> int:
+    """How many rounds stand within each other."""
+    return 1 + max(map(_rounds, block.blocks)) if isinstance(block, Rounds) else 0
