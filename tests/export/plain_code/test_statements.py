@@ -16,6 +16,7 @@ from shipped_files import SHIPPED
 from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.export.plain_code.c_text import printed_step
+from loopwright.pipeline.export.plain_code.fusing import fused
 from loopwright.pipeline.export.plain_code.interpreter import run
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.memory import laid_out, overlaps, without_copies
@@ -46,7 +47,7 @@ def test_statements_of_a_law_that_operators_steer(tmp_path: Path, sizes: tuple[i
 
 @pytest.mark.parametrize("file", SHIPPED, ids=name)
 def test_no_two_arrays_of_one_life_share_memory(file: Path) -> None:
-    program = without_copies(lowered(onnx.load(file)))
+    program = fused(without_copies(lowered(onnx.load(file))))
     memory = laid_out(program)
     assert overlaps(program, memory) == []
     assert 8 * memory.size <= MOST_STACK
