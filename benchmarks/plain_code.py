@@ -2,8 +2,9 @@
 
 ``python benchmarks/plain_code.py [FILE ...] [--points N] [--compiler "gcc -O2"]``: for each file (all shipped ones) the
 seconds of the export and of the compiler, bytes of the object, its stack and its tables, whether the self-test finds
-the same bits, and the median of a step of the C and of onnxruntime, in turns in one run. Then the largest errors of the
-functions over N points each, in units of the last place, against mpmath. About a minute and a half a predictive file.
+the same bits, and medians of a step: of the C, called from C and from Python, and of onnxruntime, in turns in one run.
+Then the largest errors of the functions over N points each, in units of the last place, against mpmath. About 20 s a
+predictive file.
 """
 
 from __future__ import annotations
@@ -23,15 +24,27 @@ import numpy as np
 import onnx
 from mpmath import mp
 
-from loopwright.pipeline.export.plain_code.c_files import c_folder
+from loopwright.pipeline.export.plain_code.c_files import arguments_of, c_folder
+from loopwright.pipeline.export.plain_code.c_header import OUTPUTS
 from loopwright.pipeline.export.plain_code.c_text import printed_step
 from loopwright.pipeline.export.plain_code.elementary import plain_exp, plain_log, plain_tanh
 from loopwright.pipeline.export.plain_code.lowering import lowered
+from loopwright.pipeline.export.plain_code.statements import OUTPUT
 from loopwright.serving import Controller
+from loopwright.serving.manifest import INPUTS
 
+_DOUBLES = ctypes.POINTER(ctypes.c_double)
 ROOT = Path(__file__).parents[1]
 STEPS = 2_000  # timed of each
-TURNS = 5  # the two change places so often
+TURNS = 20  # they change places so often
+CALLER = """#include "law.h"
+void law_often(int times, const double *const *in, double *const *out)
+{
+    for (int k = 0; k < times; ++k) {
+        LAW_CALL(in, out);
+    }
+}
+"""
 
 
 def row(file: Path, compiler: str) -> str:
@@ -50,40 +63,51 @@ def row(file: Path, compiler: str) -> str:
         compiled = time.monotonic() - began
         said = subprocess.run(["make", "-s", "check"], cwd=folder, capture_output=True, text=True, check=False)
         size = (folder / "law.o").stat().st_size
-        shared = [*shlex.split(compiler), "-ffp-contract=off", "-shared", "-fPIC", "law.c", "-lm", "-o", "law.so"]
-        subprocess.run(shared, cwd=folder, check=True)
-        plain, ours = _times(controller, ctypes.CDLL(str(folder / "law.so")))
+        (folder / "caller.c").write_text(CALLER, encoding="utf-8")
+        shared = [*shlex.split(compiler), "-ffp-contract=off", "-shared", "-fPIC", "law.c", "caller.c", "-lm"]
+        subprocess.run([*shared, "-o", "law.so"], cwd=folder, check=True)
+        plain, ours, called = _times(controller, ctypes.CDLL(str(folder / "law.so")))
     bits = "same bits" if said.returncode == 0 else "OTHER BITS"
     return (
         f"{file.parent.name}/{file.stem:28s} {bits}  export {printed:5.2f} s  compiled {compiled:5.1f} s  object "
         f"{size / 1000:5.0f} kB  stack {step.work_bytes / 1024:5.1f} KiB  tables {step.table_bytes / 1000:5.0f} kB  "
-        f"{step.operations:6d} operations  step {ours:6.2f} us, onnxruntime {plain:6.1f} us"
+        f"{step.operations:6d} operations  step {ours:6.2f} us, from Python {called:6.2f} us, "
+        f"onnxruntime {plain:6.1f} us"
     )
 
 
-def _times(controller: Controller, library: ctypes.CDLL) -> tuple[float, float]:
-    """Medians of a step [us]: of the session that the runtime binds, and of the C."""
+def _times(controller: Controller, library: ctypes.CDLL) -> tuple[float, float, float]:
+    """Medians of a step [us]: of the session that the runtime binds, of the C, and of the C called from Python."""
     m = controller.manifest
     program = lowered(onnx.load(controller.path))
     middle = {"sp": m.sp, "pv": m.pv, "dv": m.dv, "mv_applied": m.mv}
     given = {n: np.array([s.middle for s in signals]) for n, signals in middle.items()}
     given |= {"state": np.zeros(m.n_state), "operate": np.array([e.default for e in m.operate])}
     given |= {"fresh": np.ones(len(m.pv)), "ahead": np.zeros(program.inputs.get("ahead", 0))}
-    inputs = [np.ascontiguousarray(given[n], dtype=np.float64) for n in program.inputs]
-    outputs = [np.zeros(count) for count in program.outputs.values() if count]
-    pointers = [v.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for v in (*inputs, *outputs)]
+    given = {n: np.ascontiguousarray(v, dtype=np.float64) for n, v in given.items()}
+    made = {n.removeprefix(OUTPUT): np.zeros(count) for n, count in program.outputs.items() if count}
+    pointers = {n: v.ctypes.data_as(_DOUBLES) for n, v in (given | made).items()}
+    arguments = [pointers[n] for n in arguments_of(program)]
+    all_in, all_out = ((_DOUBLES * len(names))(*(pointers.get(n) for n in names)) for names in (INPUTS, OUTPUTS))
     flat = np.zeros((1, controller.width))
     for name, at in controller.places.items():
         if name in program.inputs:
             flat[0, at] = given[name]
-    taken: dict[str, list[float]] = {"ort": [], "c": []}
+    calls: dict[str, tuple[int, Callable[[], object]]] = {  # steps of a call, call
+        "onnxruntime": (1, lambda: controller.compute(flat)),
+        "c": (10, lambda: library.law_often(10, all_in, all_out)),
+        "many": (110, lambda: library.law_often(110, all_in, all_out)),
+        "python": (1, lambda: library.law_step(*arguments)),
+    }
+    taken: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(TURNS):
-        for name, call in (("ort", lambda: controller.compute(flat)), ("c", lambda: library.law_step(*pointers))):
-            for _ in range(STEPS // TURNS):
+        for name, (steps, call) in calls.items():
+            for _ in range(max(5, STEPS // TURNS // steps)):
                 began = time.perf_counter()
                 call()
                 taken[name].append(time.perf_counter() - began)
-    return 1e6 * float(np.median(taken["ort"])), 1e6 * float(np.median(taken["c"]))
+    medians = {name: 1e6 * float(np.median(times)) for name, times in taken.items()}
+    return medians["onnxruntime"], (medians["many"] - medians["c"]) / 100, medians["python"]
 
 
 def worst(ours: Callable[[float], float], exact: Callable[..., float], points: np.ndarray) -> float:

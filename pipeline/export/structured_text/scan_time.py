@@ -67,9 +67,11 @@ PROCESSORS = (
 
 def step_counts(program: PlainProgram) -> StepCounts:
     """Operations, accesses and rounds of a program: the same at each step but for choices, which count whole."""
-    each = [(s, s.operations * (_of_function(OWN[s.op]) if s.op in OWN else 1)) for s in program.statements]
+    done = [(s.op, prod(s.loops)) for s in program.statements]
+    done += [(then.op, prod(s.outer)) for s in program.statements for then in s.then]
+    each = [(op, rounds * (_of_function(OWN[op]) if op in OWN else 1)) for op, rounds in done]
     return StepCounts(
-        sum(rounds * _TWICE.get(s.op, 1) for s, rounds in each),
+        sum(rounds * _TWICE.get(op, 1) for op, rounds in each),
         sum(_accesses(s) for s in program.statements),
         sum(rounds for _, rounds in each),
     )
@@ -92,9 +94,9 @@ def _of_function(name: str) -> int:
 
 
 def _accesses(s: PlainStatement) -> int:
-    outer = prod(s.loops[: len(s.loops) - s.summed])
     added = {"dot": s.args[2:], "sum": s.args[1:]}.get(s.op, ())
-    return outer * (1 + len(added)) + s.operations * (len(s.args) - len(added))
+    once = 1 + len(added) + sum(len(then.args) for then in s.then)
+    return prod(s.outer) * once + prod(s.loops) * (len(s.args) - len(added))
 
 
 def estimates(program: PlainProgram) -> list[str]:
