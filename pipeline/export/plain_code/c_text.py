@@ -135,7 +135,7 @@ class _Printer:
         """Sums of products beside each other, each in its own order."""
         s = lanes[0]
         names = [f"s{m}" for m in range(len(lanes))] if len(lanes) > 1 else ["s"]
-        yield f"{indent}double {', '.join(f'{name} = 0.0' for name in names)};"
+        yield from (f"{indent}double {name} = 0.0;" for name in names)
         at = indent
         for d in range(len(s.outer), len(s.loops)):
             yield f"{at}{_loop(COUNTERS[d], s.loops[d])}"
@@ -179,7 +179,7 @@ class _Printer:
     def then(self, s: PlainStatement, value: str, op: str) -> str:
         """``value``, which ``op`` made, after what is done with it."""
         for after in s.then:
-            if op in INFIX or op in _WITHOUT_CALL:
+            if (op in INFIX or op in _WITHOUT_CALL) and (after.op in INFIX or after.op in _WITHOUT_CALL):
                 value = f"({value})"
             others = [self.entry(p) for p in after.args]
             value, op = _value(after.op, [*others[: after.at], value, *others[after.at :]]), after.op

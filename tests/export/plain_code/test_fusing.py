@@ -146,7 +146,7 @@ def test_compiled_random_graphs_have_the_bits_of_their_statements(level: str, tm
     for k, text in enumerate(texts):
         (tmp_path / f"law{k}.c").write_text(f"#include <math.h>\n{text}", encoding="utf-8")
         made = tmp_path / f"law{k}.so"
-        flags = ["-std=c99", level, "-Wall", "-Wconversion", "-Werror", "-ffp-contract=off", "-shared", "-fPIC"]
+        flags = ["-std=c99", level, "-Wconversion", "-Werror", "-ffp-contract=off", "-shared", "-fPIC"]
         subprocess.run(["gcc", *flags, tmp_path / f"law{k}.c", "-o", made, "-lm"], check=True)
         library[k] = getattr(ctypes.CDLL(str(made)), f"law{k}_step")
     for k, program in enumerate(programs):
