@@ -13,6 +13,7 @@ from typing import Any
 from loopwright.pipeline.export.plain_code.statements import Place, PlainStatement
 
 LONGEST = 16  # statements of a round that are looked for: the steps of today's laws have one to four
+DEEPEST = 3  # rounds within each other: the texts have as many counters for them, and laws need two
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +48,11 @@ def one_by_one(blocks: Sequence[Block]) -> Iterator[PlainStatement]:
             yield from one_by_one([_moved(b, k) for b in block.blocks])
 
 
+def depth(block: Block) -> int:
+    """How many rounds stand within each other."""
+    return 1 + max(map(depth, block.blocks)) if isinstance(block, Rounds) else 0
+
+
 def _moved(block: Block, k: int) -> Block:
     """A block of round ``k`` of the outermost rounds around it."""
     if isinstance(block, Rounds):
@@ -71,7 +77,7 @@ def _of_length(blocks: Sequence[Block], length: int) -> list[Block]:
             and apart[i + alike] == apart[i + alike + length]
         ):
             alike += 1
-        if alike >= length:
+        if alike >= length and max(map(depth, blocks[i : i + length])) < DEEPEST:
             times = 2 + alike // length
             found.append(Rounds(times, tuple(_further(blocks[k], apart[k] or []) for k in range(i, i + length))))
             i += length * times

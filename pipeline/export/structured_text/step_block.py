@@ -15,7 +15,7 @@ from loopwright.pipeline.export.plain_code.layout import (
     terms_of,
 )
 from loopwright.pipeline.export.plain_code.memory import WORK
-from loopwright.pipeline.export.plain_code.rounds import Block, Rounds
+from loopwright.pipeline.export.plain_code.rounds import Block, depth
 from loopwright.pipeline.export.plain_code.statements import Place, PlainProgram, PlainStatement
 from loopwright.pipeline.export.structured_text.elementary_functions import function_name
 from loopwright.pipeline.export.structured_text.iec_names import array_of, typed
@@ -88,7 +88,7 @@ class _Printer:
             yield f"given_{k}", "LREAL"
         for d in range(self.depth):
             yield _counter(d), "DINT"
-        for d in range(max(map(_rounds, self.layout.blocks), default=0)):
+        for d in range(max(map(depth, self.layout.blocks), default=0)):
             yield _ROUND[d], "DINT"
 
     def tables(self) -> Iterator[str]:
@@ -224,8 +224,3 @@ def _counter(depth: int) -> str:
 
 def _loop(counter: str, count: int) -> str:
     return f"FOR {counter} := 0 TO {count - 1} DO"
-
-
-def _rounds(block: Block) -> int:
-    """How many rounds stand within each other."""
-    return 1 + max(map(_rounds, block.blocks)) if isinstance(block, Rounds) else 0

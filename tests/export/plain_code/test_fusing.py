@@ -21,10 +21,10 @@ from shipped_files import SHIPPED
 from loopwright.pipeline.export.plain_code.c_text import printed_step
 from loopwright.pipeline.export.plain_code.fusing import fused
 from loopwright.pipeline.export.plain_code.interpreter import run
-from loopwright.pipeline.export.plain_code.layout import PrintedLayout
+from loopwright.pipeline.export.plain_code.layout import ROUND_COUNTERS, PrintedLayout
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.memory import in_one_memory, laid_out, without_copies
-from loopwright.pipeline.export.plain_code.rounds import Rounds, in_rounds, one_by_one
+from loopwright.pipeline.export.plain_code.rounds import DEEPEST, Rounds, depth, in_rounds, one_by_one
 from loopwright.pipeline.export.plain_code.statements import Floats, Place, PlainProgram, PlainStatement
 
 ODD = (0.0, -0.0, 1e300, -1e-300, np.inf, -np.inf, np.nan)
@@ -190,6 +190,16 @@ def test_rounds_are_found_and_in_them_rounds() -> None:
     assert in_rounds([*three[:2], other, three[2]]) == (*three[:2], other, three[2])
     irregular = [*three[:2], copied(60, 6)]
     assert in_rounds(irregular) == tuple(irregular)
+
+
+def test_rounds_stand_within_each_other_as_deep_as_the_texts_have_counters() -> None:
+    sizes = (3, 4, 5, 3, 4)
+    counters = np.indices(sizes).reshape(len(sizes), -1).T
+    far = counters @ np.array([7**5, 7**4 + 1, 7**3 + 2, 7**2 + 3, 7])
+    statements = [PlainStatement("copy", Place("w", int(n), ()), (Place("sp", 0, ()),), ()) for n in far]
+    found = in_rounds(statements)
+    assert max(map(depth, found)) == DEEPEST == len(ROUND_COUNTERS)
+    assert list(one_by_one(found)) == statements
 
 
 def test_what_is_read_twice_or_in_another_order_stays() -> None:
