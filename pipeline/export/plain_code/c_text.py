@@ -171,7 +171,7 @@ class _Printer:
             yield f"{indent.removesuffix(_DEEPER)}}}"
 
     def finished(self, s: PlainStatement, name: str) -> str:
-        """What is written of the sum or extreme of that name."""
+        """The value to write, from the sum or extreme of that name."""
         added = s.args[2:] if s.op == "dot" else s.args[1:] if s.op == "sum" else ()
         value = " + ".join([name, *map(self.entry, added)])
         return self.then(s, value, "add" if added else "")

@@ -63,6 +63,6 @@ class PrintedLayout:
 
 
 def terms_of(place: Place, loops: int | None = None, prefix: str = "") -> list[str]:
-    """What the counters of rounds and of the first ``loops`` loops, or of all, add to a place's offset."""
+    """Terms that the counters of rounds and of the first ``loops`` loops, or of all, add to a place's offset."""
     steps = [*zip(place.further, ROUND_COUNTERS, strict=False), *zip(place.strides[:loops], COUNTERS, strict=False)]
     return [f"{n} * {prefix}{name}" if n != 1 else f"{prefix}{name}" for n, name in steps if n]

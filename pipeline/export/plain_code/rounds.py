@@ -17,14 +17,14 @@ DEEPEST = 3  # rounds within each other: the texts have as many counters for the
 
 
 @dataclass(frozen=True, slots=True)
-class Rounds:
+class RepeatedBlocks:
     """``blocks`` done ``times`` times, each place ``further`` entries on in every round."""
 
     times: int
     blocks: tuple[Block, ...]
 
 
-Block = PlainStatement | Rounds
+Block = PlainStatement | RepeatedBlocks
 
 
 def in_rounds(statements: Sequence[PlainStatement]) -> tuple[Block, ...]:
@@ -50,12 +50,12 @@ def one_by_one(blocks: Sequence[Block]) -> Iterator[PlainStatement]:
 
 def depth(block: Block) -> int:
     """How many rounds stand within each other."""
-    return 1 + max(map(depth, block.blocks)) if isinstance(block, Rounds) else 0
+    return 1 + max(map(depth, block.blocks)) if isinstance(block, RepeatedBlocks) else 0
 
 
 def _moved(block: Block, k: int) -> Block:
     """A block of round ``k`` of the outermost rounds around it."""
-    if isinstance(block, Rounds):
+    if isinstance(block, RepeatedBlocks):
         return replace(block, blocks=tuple(_moved(b, k) for b in block.blocks))
     return block.at_places(lambda p: replace(p, offset=p.offset + k * p.further[0], further=p.further[1:]))
 
@@ -79,7 +79,9 @@ def _of_length(blocks: Sequence[Block], length: int) -> list[Block]:
             alike += 1
         if alike >= length and max(map(depth, blocks[i : i + length])) < DEEPEST:
             times = 2 + alike // length
-            found.append(Rounds(times, tuple(_further(blocks[k], apart[k] or []) for k in range(i, i + length))))
+            found.append(
+                RepeatedBlocks(times, tuple(_further(blocks[k], apart[k] or []) for k in range(i, i + length)))
+            )
             i += length * times
         else:
             found.append(blocks[i])
@@ -97,7 +99,7 @@ def _offsets(block: Block) -> list[int]:
 
 def _kind(block: Block) -> tuple[Any, ...]:
     """All of a block but its offsets."""
-    if isinstance(block, Rounds):
+    if isinstance(block, RepeatedBlocks):
         return (block.times, *(_kind(b) for b in block.blocks))
     return (block.at_places(lambda p: replace(p, offset=0)),)
 
@@ -107,7 +109,7 @@ def _further(block: Block, steps: list[int]) -> Block:
     left = iter(steps)
 
     def of(b: Block) -> Block:
-        if isinstance(b, Rounds):
+        if isinstance(b, RepeatedBlocks):
             return replace(b, blocks=tuple(of(inner) for inner in b.blocks))
         return b.at_places(lambda p: replace(p, further=(next(left), *p.further)))
 

@@ -43,7 +43,7 @@ TOGETHER: Final[Mapping[str, tuple[int, ...]]] = {
 class Place:
     """Entry ``offset + sum strides_d i_d`` of an array, or, with a ``table``, the entry that the table has there.
 
-    In rounds (``rounds.Rounds``) it lies ``further`` entries on with each round of those around it.
+    In rounds (``rounds.RepeatedBlocks``) it lies ``further`` entries on with each round of those around it.
     """
 
     buffer: str
@@ -75,7 +75,7 @@ class Then:
 class PlainStatement:
     """One nest of loops: ``loops`` counts, outer ones first, of which the last ``summed`` are put together.
 
-    What ``then`` says is done with the result, one operation after the other, before it is written.
+    The operations of ``then`` are done on the result, one after the other, before it is written.
     """
 
     op: str
@@ -103,7 +103,7 @@ class PlainStatement:
 
     @property
     def places(self) -> tuple[Place, ...]:
-        """What it writes, and all that it reads."""
+        """The place that it writes, then all that it reads."""
         return (self.target, *self.read)
 
     @property

@@ -24,7 +24,7 @@ from loopwright.pipeline.export.plain_code.interpreter import run
 from loopwright.pipeline.export.plain_code.layout import ROUND_COUNTERS, PrintedLayout
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.memory import in_one_memory, laid_out, without_copies
-from loopwright.pipeline.export.plain_code.rounds import DEEPEST, Rounds, depth, in_rounds, one_by_one
+from loopwright.pipeline.export.plain_code.rounds import DEEPEST, RepeatedBlocks, depth, in_rounds, one_by_one
 from loopwright.pipeline.export.plain_code.statements import Floats, Place, PlainProgram, PlainStatement
 
 ODD = (0.0, -0.0, 1e300, -1e-300, np.inf, -np.inf, np.nan)
@@ -176,15 +176,15 @@ def test_rounds_are_found_and_in_them_rounds() -> None:
     three = [copied(40 + 4 * k, 3 * k) for k in range(3)]
     assert in_rounds(three[:2]) == tuple(three[:2])
     (found,) = in_rounds(three)
-    assert isinstance(found, Rounds)
+    assert isinstance(found, RepeatedBlocks)
     assert found.times == 3
     assert [p.further for b in one_by_one(found.blocks) for p in b.places] == [(4,), (3,)]
     other = PlainStatement("neg", Place("w", 0, (1,)), (Place("w", 4, (1,)),), (4,))
     swept = [s for sweep in range(5) for s in (*(copied(40 + 4 * k, 20 * sweep + k) for k in range(3)), other)]
     (found,) = in_rounds(swept)
-    assert isinstance(found, Rounds)
+    assert isinstance(found, RepeatedBlocks)
     assert found.times == 5
-    assert isinstance(found.blocks[0], Rounds)
+    assert isinstance(found.blocks[0], RepeatedBlocks)
     assert found.blocks[1] == other.at_places(lambda p: replace(p, further=(0,)))
     assert list(one_by_one([found])) == swept
     assert in_rounds([*three[:2], other, three[2]]) == (*three[:2], other, three[2])
