@@ -57,18 +57,16 @@ def pi_of(circle: Circle) -> PID:
     return PID.design(PID.Params(tuning="manual", kc=circle.kc, ti_s=circle.ti_s), {}, simulated.signals, simulated)
 
 
-def begun(folder: Path, circle: Circle) -> tuple[Plant, RunningLoop]:
-    """The plant and its loop, in AUTO."""
+def begun(folder: Path, circle: Circle, file: Path, *, unproven: bool = False) -> tuple[Plant, RunningLoop]:
+    """The plant and its loop of a file, in AUTO."""
     folder = folder.absolute()  # the plant's process has a folder of its own
     folder.mkdir(parents=True, exist_ok=True)
     plant = Plant(folder, circle.case, circle.speed, "--noise")
     plant.start()
     path = folder / "loop.toml"
     path.unlink(missing_ok=True)
-    file = folder / "pi.onnx"
-    export(pi_of(circle), file, case=circle.case, provenance={})
     assert main(["loop", "init", str(file), "--endpoint", plant.endpoint, "--out", str(path)]) == 0
-    settings = f"speed = {circle.speed}\naccept_unproven = true"  # no closed loop proved the PI
+    settings = f"speed = {circle.speed}\naccept_unproven = {str(unproven).lower()}"
     text = path.read_text().replace('page = "127.0.0.1:8080"', settings).replace("SHADOW", "AUTO", 1)
     written, patient = (f"max_age_s = {age:g}" for age in circle.max_age_s)
     assert written in text
@@ -78,7 +76,9 @@ def begun(folder: Path, circle: Circle) -> tuple[Plant, RunningLoop]:
 
 def record(folder: Path, circle: Circle) -> None:
     """Set points that move now and then, and the journal as an export."""
-    plant, loop = begun(folder, circle)
+    folder.mkdir(parents=True, exist_ok=True)
+    export(pi_of(circle), folder / "pi.onnx", case=circle.case, provenance={})
+    plant, loop = begun(folder, circle, folder / "pi.onnx", unproven=True)  # no closed loop proved it
     rng, journal = random.Random(0), loop.settings.journal.file
     try:
         while loop.station.scans < circle.rows:
@@ -92,8 +92,8 @@ def record(folder: Path, circle: Circle) -> None:
 
 
 def swap(folder: Path, controller: Path, circle: Circle) -> None:
-    """The new controller takes over, and holds a set point."""
-    plant, loop = begun(folder / "swap", circle)
+    """The new controller takes over from the case's own, which asks for a proven one, and holds a set point."""
+    plant, loop = begun(folder / "swap", circle, Path("artifacts", circle.case, "pid.onnx"))
     journal = loop.settings.journal.file
     try:
         ask(journal, {"do": "sp", "value": {circle.sp: circle.move[0]}, "who": "engineer"})
