@@ -136,15 +136,11 @@ class _Printer:
         s = lanes[0]
         names = [f"s{m}" for m in range(len(lanes))] if len(lanes) > 1 else ["s"]
         yield from (f"{indent}double {name} = 0.0;" for name in names)
-        at = indent
-        for d in range(len(s.outer), len(s.loops)):
-            yield f"{at}{_loop(COUNTERS[d], s.loops[d])}"
-            at += _DEEPER
-        for name, lane in zip(names, lanes, strict=True):
-            yield f"{at}{name} += {self.entry(lane.args[0])} * {self.entry(lane.args[1])};"
-        for _ in range(len(s.outer), len(s.loops)):
-            at = at.removesuffix(_DEEPER)
-            yield f"{at}}}"
+        added = [
+            f"{name} += {self.entry(lane.args[0])} * {self.entry(lane.args[1])};"
+            for name, lane in zip(names, lanes, strict=True)
+        ]
+        yield from _summed(s, added, indent)
         for name, lane in zip(names, lanes, strict=True):
             yield f"{indent}{self.entry(lane.target)} = {self.finished(lane, name)};"
 
@@ -155,17 +151,9 @@ class _Printer:
             indent += _DEEPER
         extreme, args = EXTREMES.get(s.op), [self.entry(p) for p in s.args]
         yield f"{indent}double s = {self.entry(s.args[0], len(s.outer)) if extreme else '0.0'};"
-        at = indent
-        for d in range(len(s.outer), len(s.loops)):
-            yield f"{at}{_loop(COUNTERS[d], s.loops[d])}"
-            at += _DEEPER
-        if extreme:
-            yield f"{at}s = plain_{extreme}(s, {args[0]});"
-        else:
-            yield f"{at}s += {args[0]}{' * ' + args[0 if s.op == 'sum_squares' else 1] if s.op != 'sum' else ''};"
-        for _ in range(len(s.outer), len(s.loops)):
-            at = at.removesuffix(_DEEPER)
-            yield f"{at}}}"
+        factors = [args[0]] * 2 if s.op == "sum_squares" else args[: 2 if s.op == "dot" else 1]
+        line = f"s = plain_{extreme}(s, {args[0]});" if extreme else f"s += {' * '.join(factors)};"
+        yield from _summed(s, [line], indent)
         yield f"{indent}{self.entry(s.target)} = {self.finished(s, 's')};"
         if not s.outer:
             yield f"{indent.removesuffix(_DEEPER)}}}"
@@ -226,8 +214,17 @@ def _value(op: str, args: Sequence[str]) -> str:
     return f"{OWN.get(op, f'plain_{op}')}({', '.join(args)})"
 
 
-def _counter(depth: int) -> str:
-    return "ijklmn"[depth]
+def _summed(s: PlainStatement, lines: Sequence[str], indent: str) -> Iterator[str]:
+    """The lines within the summed loops of a statement."""
+    at = indent
+    for d in range(len(s.outer), len(s.loops)):
+        yield f"{at}{_loop(COUNTERS[d], s.loops[d])}"
+        at += _DEEPER
+    for line in lines:
+        yield f"{at}{line}"
+    while at != indent:
+        at = at.removesuffix(_DEEPER)
+        yield f"{at}}}"
 
 
 def _loop(counter: str, count: int) -> str:
