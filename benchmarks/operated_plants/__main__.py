@@ -21,7 +21,7 @@ defaults and gates, and the shipped file steps the same days, beside the NMPC. W
 temporary files until the product's code or the plant changes. A plant that is refused, or that ships no predictive
 file, is a row that says so. Half an hour of one core a plant.
 
-``--solved``: ours beside its own law with each quadratic problem solved to its end, in place of sweeps: some minutes.
+``--solved``: ours beside its own law with each quadratic problem solved to its end: some minutes.
 
 ``--operating``: priorities where ranges are at odds, and bumps of changes, on the files of three plants instead.
 ``--json FILE`` keeps the figures, ``--picture FILE`` draws the first day of the first plant.

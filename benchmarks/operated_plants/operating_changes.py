@@ -20,7 +20,7 @@ from loopwright.serving.operating import Operate
 
 QUIET = 600  # samples without noise until all rests
 CHANGES = 60  # random changes, drawn by seed 0
-CONVERGED = {"passes": 12, "sweeps": 60}  # of the law's own problem: what the new optimum asks
+CONVERGED = {"passes": 12, "changes": 40}  # of the law's own problem: what the new optimum asks
 
 
 @dataclass(frozen=True, slots=True)

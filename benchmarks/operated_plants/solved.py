@@ -1,46 +1,30 @@
-"""Ours with each quadratic problem solved to its end, in place of sweeps: what the solver costs."""
+"""Ours with each quadratic problem solved to its end, in place of two changes: what the solver costs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from types import MethodType
 
 import numpy as np
 import torch
 from figures import Figures, figures_of, run_day
 from from_record import Fit, Served, controller_of, law_of
 from operated_plant import OperatedPlant
-from scipy.optimize import lsq_linear
-from torch import Tensor
 
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.qp_solver import Planner
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.serving import Controller
 
-POINT = 1e-9  # scaled: a range of moves that is narrower is one value
-
-
-def solved(planner: Planner, curvature: Tensor, pull: Tensor, plan: Tensor, middle: Tensor, half: Tensor) -> Tensor:
-    """The minimum of z'Hz/2 - pull z within middle +- half (1, m) by an active set, as least squares of H = L L'."""
-    m = planner.m
-    h, b = curvature.numpy().reshape(m, m), pull.numpy().ravel()
-    low, high = ((middle + by * half).numpy().ravel() for by in (-1, 1))
-    root = np.linalg.cholesky(0.5 * (h + h.T))
-    ends = (low, np.where(high - low < POINT, low + POINT, high))
-    found = lsq_linear(root.T, np.linalg.solve(root, b), ends, method="bvls", tol=1e-13, max_iter=500)
-    return torch.from_numpy(np.clip(found.x, low, high)).reshape(plan.shape)
+CHANGES = 60  # of what lies at a bound: all that a day of these plants asks for, and more
 
 
 class Solved(Served):
-    """The law itself through a day. Rates bound each of its planned moves by how far they bring the MV until then."""
+    """The law itself through a day, its problems solved to their end."""
 
     def __init__(self, controller: Controller, law: Predictive, passes: int) -> None:
         super().__init__(controller)
         self.law = law
-        planner = law.planner
-        planner.passes, planner.rate = passes, None
-        planner._descended_within = MethodType(solved, planner)  # type: ignore[method-assign]
+        assert law.planner.bounded is not None  # a law with `operate`
+        law.planner.passes, law.planner.bounded.changes = passes, CHANGES
 
     def __call__(self, sp: Array, pv: Array, dv: Array, mv: Array, fresh: Array) -> Array:
         """The MVs until the next sample."""

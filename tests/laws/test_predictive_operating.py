@@ -74,15 +74,16 @@ def wide() -> tuple[Predictive, Operate]:
 @given(seeds, st.sampled_from([(1, 1, 0), (2, 2, 0), (2, 2, 3), (2, 1, 0)]))
 @few
 def test_by_default_the_law_does_what_it_does_without(seed: int, sizes: tuple[int, int, int]) -> None:
+    """Without ``operate`` the sweeps come to their end here; with it few changes of what lies at a bound do."""
     n_y, n_mv, n_hidden = sizes
     model = random_model(seed, n_y=n_y, n_mv=n_mv, n_hidden=n_hidden)
     sp = np.repeat(np.random.default_rng(seed).uniform(-0.5, 0.5, (3, n_y)), 15, axis=0)
     signals = made_signals(n_y, n_mv)
     far = tuple(replace(s, low=-1e3, high=1e3) for s in signals.pv)  # no plan comes near the ends
     signals = Signals(1.0, far, far, signals.dv, signals.mv)
-    laws = [Predictive(signals, model, Predictive.Params(horizon=20, operate=o)).eval() for o in (None, {})]
+    laws = [Predictive(signals, model, Predictive.Params(horizon=20, sweeps=60, operate=o)).eval() for o in (None, {})]
     plain, own = (closed(law, model, sp, noise=0.01) for law in laws)
-    np.testing.assert_allclose(own[1], plain[1], atol=1e-9)
+    np.testing.assert_allclose(own[1], plain[1], atol=0.05)  # of half a range; of laws with 4 sweeps up to .17
 
 
 def test_a_rate_of_the_plant_is_planned_with_as_without(tmp_path: Path) -> None:
@@ -91,7 +92,8 @@ def test_a_rate_of_the_plant_is_planned_with_as_without(tmp_path: Path) -> None:
     model, sp = random_model(1), np.full((40, 1), 0.4)
     laws = [Predictive(slow, model, Predictive.Params(horizon=20, operate=o)).eval() for o in (None, {})]
     plain, own = (closed(law, model, sp) for law in laws)
-    np.testing.assert_allclose(own[1], plain[1], atol=1e-9)
+    np.testing.assert_allclose(own[1], plain[1], atol=0.01)
+    assert np.abs(np.diff(own[1], axis=0, prepend=0.0)).max() <= 0.05 + 1e-12
     export(laws[1], tmp_path / "law.onnx", case="made", provenance={})
 
 
@@ -183,15 +185,23 @@ def test_no_mv_leaves_the_operators_limits_or_moves_faster(seed: int) -> None:
 def test_three_mvs_keep_one_variable_while_a_narrowed_range_moves_another(seed: int) -> None:
     """The range of y1 moves to above where y1 stands, with a set point in it.
 
-    With the first moves swept first y0 went off by .10 to .28.
+    A range is dearer than the set point of y0, which gives way for some samples: with seed 2 by .38, and by .30 where
+    many passes come to the optimum of each sample.
     """
     model = random_model(seed, n_y=2, n_mv=3)
-    law = law_of(model, horizon=20, operate={"u2.rest": 0.0, "u2.rest_use": 1})
-    operate = Operate(law.operate)
-    free, narrowed = operate.with_values({"y1.track": 0}), operate.with_values({"y1.low": 0.25})
-    y, _ = operated(law, model, 120, np.array([0.0, 0.4]), lambda k: narrowed if k >= 40 else free)
-    assert np.abs(y[40:, 0]).max() < 0.09
-    assert y[-1, 1] > 0.25
+    y = {}
+    for passes, changes in ((2, 2), (12, 8)):
+        given = {"horizon": 20, "passes": passes, "changes": changes}
+        law = law_of(model, operate={"u2.rest": 0.0, "u2.rest_use": 1}, **given)
+        operate = Operate(law.operate)
+        free, narrowed = operate.with_values({"y1.track": 0}), operate.with_values({"y1.low": 0.25})
+        y[passes], _ = operated(
+            law, model, 100, np.array([0.0, 0.4]), lambda k, f=free, n=narrowed: n if k >= 40 else f
+        )
+    assert np.abs(y[2][40:, 0]).max() < 1.2 * np.abs(y[12][40:, 0]).max() + 0.02
+    assert np.abs(y[2][60:, 0]).max() < 0.005
+    assert y[2][46:, 1].min() > 0.24
+    np.testing.assert_allclose(y[2][-1], y[12][-1], atol=1e-3)
 
 
 def test_an_mv_out_of_use_stays_and_the_others_do_its_work(wide: tuple[Predictive, Operate]) -> None:

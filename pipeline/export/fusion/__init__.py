@@ -10,6 +10,7 @@ from loopwright.pipeline.export.fusion.forms import forms_of
 from loopwright.pipeline.export.fusion.items import Items
 from loopwright.pipeline.export.fusion.joining import joined
 from loopwright.pipeline.export.fusion.lone_factors import with_factors_apart
+from loopwright.pipeline.export.fusion.outer_products import without_turns
 from loopwright.pipeline.export.fusion.plan import Item
 from loopwright.pipeline.export.fusion.reading import GraphReading
 
@@ -36,8 +37,8 @@ def fused(model: onnx.ModelProto) -> onnx.ModelProto:
                 break
     after, items, outputs, _ = min(candidates, key=lambda c: c[0])
     if after > (1 - LEAST_SAVING) * candidates[0][3].price_before:
-        return with_factors_apart(model)
-    return emitted(items, outputs, model)
+        return without_turns(with_factors_apart(model))
+    return without_turns(emitted(items, outputs, model))
 
 
 def listed(reading: GraphReading) -> tuple[Items, Outputs]:

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.predictive.bounded_minimum import AT_BOUND
 from loopwright.pipeline.laws.predictive.predictive import Predictive
-from loopwright.pipeline.laws.predictive.qp_solver import AT_BOUND, LastPass, OperatedPlan, PlanProblem
+from loopwright.pipeline.laws.predictive.qp_solver import LastPass, OperatedPlan, PlanProblem
 
 TINY_EXCESS = 1e-12  # scaled: an output that is beyond its range by less owes it to nothing new
 
@@ -44,9 +45,9 @@ class ExplainedPredictive(nn.Module):
         H_FF u_F = g_F + l_F - H_FA u_A
 
     and the part of a term in the move of MV j is that term's share in the first entry of it: of l_F what its own limits
-    take, of H_FA u_A what it does because other MVs are at theirs. The sweeps do not get to the end of it: what is left
-    is the part ``plan``, as far as the last plan had a move, and beyond that it is spread over the causes by their
-    size. So the parts sum to the move.
+    take, of H_FA u_A what it does because other MVs are at theirs. A step away from the last plan has its
+    price: what is left is the part ``plan``, as far as the last plan had a move, and beyond that it is spread over the
+    causes by their size. So the parts sum to the move.
 
     The free run is the one that was predicted at the last step, y_0, and what is new since: of each measured
     disturbance its change, of each reading the correction P h (y_m - y_p)/R of state and loads that it makes in the
@@ -209,16 +210,12 @@ class ExplainedPredictive(nn.Module):
         moves = [self.of_mv * -by.z_cost, self.of_mv * (by.rest_weight * (by.rest - by.stands))]
         return torch.cat([outputs, *moves], dim=-2), curvature
 
-    def _held(self, problem: PlanProblem, last: LastPass, by: OperatedPlan, rest: Tensor) -> list[Tensor]:
+    def _held(self, last: LastPass, by: OperatedPlan, rest: Tensor) -> list[Tensor]:
         """Entries (..., 1, m) of the plan that are held: at a low limit, a high one, by speed, and not in use.
 
         A bound holds an entry that lies at it where the ``rest`` (..., 1, m) of the minimum's equation pulls back.
         """
         low, high, plan, near = last.low, last.high, last.plan, self.near
-        planner = self.law.planner
-        if planner.rate is not None:
-            middle = plan @ planner.before + problem.applied @ planner.first
-            low, high = planner.ends(middle, (low, high, by.rate))
         used = by.reach > 0
         upper, lower = (plan >= high - near) & (rest < 0) & used, (plan <= low + near) & (rest > 0) & used
         at_high, at_low = upper & (by.z_high <= high + near), lower & (by.z_low >= low - near)
@@ -229,7 +226,7 @@ class ExplainedPredictive(nn.Module):
         pulls, curvature = terms
         moved = last.plan - by.stands
         rest = moved @ curvature - pulls.sum(dim=-2, keepdim=True)
-        held = [torch.where(h, self.one, self.zero) for h in self._held(problem, last, by, rest)]
+        held = [torch.where(h, self.one, self.zero) for h in self._held(last, by, rest)]
         free = 1.0 - torch.cat(held, dim=-2).sum(dim=-2, keepdim=True)
         own = torch.cat([self.of_mv * (h * rest) for h in held], dim=-2)
         others = torch.cat([-(self.of_mv * (h * moved)) @ curvature for h in held], dim=-2)
@@ -253,7 +250,7 @@ class ExplainedPredictive(nn.Module):
     def _finished(self, parts: Tensor, problem: PlanProblem, by: OperatedPlan, move: Tensor) -> Tensor:
         """All parts (..., n_mv, K) [mv] of the moves (..., n_mv), with those of the last plan.
 
-        The last plan carries over no more than it had planned. All that the sweeps miss beyond that is spread over the
+        The last plan carries over no more than it had planned. All that is left beyond that is spread over the
         causes by their size.
         """
         law, n_mv, stands = self.law, self.n_mv, problem.stands

@@ -140,7 +140,7 @@ class Operation(nn.Module):
         whats = [list(dict.fromkeys(e.what for e in entries if e.group == g)) for g in groups]
         n_cv, n_mv = (len(of) * len(s) for of, s in zip(whats, (scales.y_scale, scales.mv_half), strict=True))
         held = torch.from_numpy(moves.profile.sum(axis=0)).repeat_interleave(len(scales.mv_half))
-        apart, starts = torch.from_numpy(moves.lengths), torch.tensor(moves.starts, dtype=torch.float64)
+        starts = torch.tensor(moves.starts, dtype=torch.float64)
         until = starts.repeat_interleave(len(scales.mv_half)) + 1
 
         def formulas(p: Named) -> Named:
@@ -167,7 +167,6 @@ class Operation(nn.Module):
                 "z_use": self._each_move(mv["use"]),
                 "z_low": self._each_move(first),
                 "z_high": self._each_move(last),
-                "rate": fastest * apart,
                 "reach": fastest * until,
                 "rest": self._each_move(rest),
                 "rest_weight": self._each_move(REST_WEIGHT * mv["rest_use"]) * held,
@@ -208,7 +207,6 @@ class Operation(nn.Module):
             off=off,
             z_low=p["z_low"],
             z_high=p["z_high"],
-            rate=p["rate"] * p["z_use"],
             reach=p["reach"] * p["z_use"],
             rest=p["rest"],
             rest_weight=p["rest_weight"],

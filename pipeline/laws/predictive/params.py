@@ -35,11 +35,12 @@ class PredictiveParams:
     there are as many as outputs, or else on the ``outputs``; ``record``: on the outputs, and each changes
     as much as in the record; None: ``record`` of a law with ``operate`` whose model was identified with its
     loads, else ``mvs``.
-    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; ``damping`` kappa of a pass, 0 or more; None: .5 of
-    one MV, .25 of several, and with a search the least that the loops stand. ``tuning``: ``given`` takes these numbers,
-    ``search`` starts from them and chooses speed, caution, horizon and jumps in closed loops over the model with errors
-    and loads, drawn by ``seed``. ``mv_rate`` [mv]: largest MV change a sample, which the plan knows, one number or one
-    for each MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
+    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; with ``operate`` each takes ``changes``, 0 or more,
+    of what lies at a bound in place of sweeps. ``damping`` kappa of a pass, 0 or more; None: .5 of one MV, .25 of
+    several, and with a search the least that the loops stand. ``tuning``: ``given`` takes these numbers, ``search``
+    starts from them and chooses speed, caution, horizon and jumps in closed loops over the model with errors and loads,
+    drawn by ``seed``. ``mv_rate`` [mv]: largest MV change a sample, which the plan knows, one number or one for each
+    MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
     none; None: no limits. A set point beyond a limit counts as one at the limit. ``preview`` of the set points:
     ``held``, as they are now; ``ramp``, their last slope goes on, as in a recipe of ramps; ``course``, as the input
     ``ahead`` gives them at each sample, steps to come and forecasts of measured disturbances included, and as now
@@ -63,6 +64,7 @@ class PredictiveParams:
     damping: float | None = None
     passes: int = 2
     sweeps: int = 4
+    changes: int = 2
     tuning: Literal["given", "search"] = "given"
     seed: int = 0
     mv_rate: Rates = None
@@ -87,7 +89,7 @@ class PredictiveParams:
                 raise ValueError(f"{name} is {getattr(self, name)!r}; allowed are {words}")
         if self.damping is not None and not 0 <= self.damping < np.inf:
             raise ValueError(f"damping is {self.damping}; it must be 0 or above, and finite")
-        for name, least in (("horizon", 8), ("moves", 1), ("passes", 1), ("sweeps", 1)):
+        for name, least in (("horizon", 8), ("moves", 1), ("passes", 1), ("sweeps", 1), ("changes", 0)):
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} is {value}; it must be at least {least}")

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from loopwright.pipeline.laws.base import Analysis, ControlLaw, Stepped, require_kind
+from loopwright.pipeline.laws.predictive.bounded_minimum import BoundedMinimum
 from loopwright.pipeline.laws.predictive.cold_rest import bent_rest, cold_start, held_rest
 from loopwright.pipeline.laws.predictive.disturbance_model import Loads, balanced, loads_of, recorded_changes
 from loopwright.pipeline.laws.predictive.horizon import Moves, horizon_of
@@ -115,7 +116,10 @@ class Predictive(ControlLaw):
         bounds = scaled_limits(signals, model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
-        self.planner = Planner(run, self.moves, cost, params.passes, params.sweeps, rate, walls, valleys=n_mv > n_cv)
+        bounded = None if params.operate is None else BoundedMinimum(self.moves.count, params.changes)
+        self.planner = Planner(
+            run, self.moves, cost, params.passes, params.sweeps, rate, walls, bounded, valleys=n_mv > n_cv
+        )
         self.wanted = course_of(signals, model, horizon, n_o, bounds, ramp=params.preview == "ramp")
         self.ahead = ahead_of(signals, horizon) if given else None
         self.known = None if self.ahead is None else KnownFuture(self.ahead, model, n_o)

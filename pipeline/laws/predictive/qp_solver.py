@@ -11,14 +11,10 @@ from torch import Tensor, nn
 from torch.nn.functional import hardtanh
 
 from loopwright.pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.predictive.bounded_minimum import BoundedMinimum
 from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, NetworkHorizon, Prediction, product
 from loopwright.pipeline.laws.predictive.soft_limits import EPS, SOFT, LimitCost, SoftLimits, limit_cost
 from loopwright.pipeline.models.memory import Named
-
-LEAST_HALF = 1e-9  # of half an MV's range: a narrower one is a point
-LEAST_BEND = 1e-30  # of a cost along a direction: nothing moves
-MOST_LENGTH = 1e3  # sweeps that one step along a valley stands for
-AT_BOUND = 1e-9  # scaled: an entry this near a bound that does not move holds nothing back
 
 
 class OperatedPlan(NamedTuple):
@@ -36,7 +32,6 @@ class OperatedPlan(NamedTuple):
     off: Tensor  # by how much the actuator stands off its command, at every move: it stays so
     z_low: Tensor  # of the moves
     z_high: Tensor
-    rate: Tensor  # largest difference from the move before; 0 out of use
     reach: Tensor  # largest difference from the applied MV: as far as the rate brings it until then; 0 out of use
     rest: Tensor  # of the moves
     rest_weight: Tensor  # curvature of the cost of being away from it
@@ -72,7 +67,7 @@ class PlanProblem(NamedTuple):
 
 
 class LastPass(NamedTuple):
-    """The quadratic problem of the last pass, and the plan that its sweeps made of the one ``before``; scaled."""
+    """The quadratic problem of the last pass, and the plan that it made of the one ``before``; scaled."""
 
     plan: Tensor  # (..., 1, m)
     before: Tensor  # (..., 1, m)
@@ -108,12 +103,14 @@ class Planner(nn.Module):
 
         sum w (e + S dz)^2/2 + mu sum_j |z_j - z_{j-1}|^2 + kappa sum_p H_pp dz_p^2/2
 
-    within its bounds, by ``sweeps`` rounds of coordinate descent; H_pp is the curvature of the other terms. A fixed
-    point is a minimum of the cost itself, whatever the damping kappa. Without damping full steps over a strongly bent
-    model can throw the plan from pass to pass, and the loop then amplifies rounding. An error counts by its size, not
-    by its square: large ones do not decide alone. With ``rate`` (n_mv,) each move differs from the one before by at
-    most its length in samples times the rate. The cost of ``limits`` is added, by a quadratic of the same kind; no
-    quadratic stands for a limit that the present plan keeps, so that it does not slow down the approach.
+    within its bounds, by ``sweeps`` rounds of coordinate descent, or, within operators' bounds, by ``bounded``; H_pp
+    is the curvature of the other terms. A fixed point is a minimum of the cost itself, whatever the damping kappa.
+    Without damping full steps over a strongly bent model can throw the plan from pass to pass, and the loop then
+    amplifies rounding. An error counts by its size, not by its square: large ones do not decide alone. With ``rate``
+    (n_mv,) each move differs from the one before by at most its length in samples times the rate; within operators'
+    bounds each lies as near to the applied MV as the rate brings it until then. The cost of ``limits`` is added, by a
+    quadratic of the same kind; no quadratic stands for a limit that the present plan keeps, so that it does not slow
+    down the approach.
 
     Source: iteratively reweighted least squares, Huber, Robust Statistics, section 7.8; coordinate descent, Wright,
     Mathematical Programming 151 (2015) 3.
@@ -129,10 +126,8 @@ class Planner(nn.Module):
     eye: Tensor  # (m, m)
     stiff: Tensor  # (m, m) ones, and 1 + kappa on the diagonal
     damping: Tensor  # (1,) kappa
-    apart: Tensor  # (m, m) ones, and 0 on the diagonal
     soft: Tensor  # (1,) of the price of a range
     blunt: Tensor  # (1,) of the price of a range
-    near: Tensor  # (1,) to a bound
 
     def __init__(
         self,
@@ -143,20 +138,13 @@ class Planner(nn.Module):
         sweeps: int,
         rate: Tensor | None = None,
         limits: SoftLimits | None = None,
+        bounded: BoundedMinimum | None = None,
         *,
         valleys: bool = False,
     ) -> None:
         super().__init__()
-        self.valleys = valleys  # more MVs than set points: a step along the cost's flat directions beside the sweeps
-        # Within operators' bounds and without rates such a law sweeps later moves first, each move's MVs in their
-        # order: the first move, which acts, is then the best beside all others as they end. With the first move first
-        # its first MV took what a range asked for, sample after sample, and the last one stayed: three valves went to
-        # their ends together, and a set point within a range that was narrowed was not reached. With all in reverse
-        # noise at the end of a range did the same. With rates, which hold such a drift back, the first move stays
-        # first: of two ranges at odds on a furnace the later ones first kept the wrong one.
-        starts, each = len(moves.starts), moves.count // len(moves.starts)
-        turned = [g * each + j for g in reversed(range(starts)) for j in range(each)]
-        self.order = turned if valleys else list(range(moves.count))
+        self.valleys = valleys  # more MVs than set points: they may move together as no output shows
+        self.bounded = bounded  # of a law with operators' bounds
         self.limits = limits
         self.horizon, self.passes, self.sweeps, self.m = horizon, passes, sweeps, moves.count
         self.n_cv = len(cost.weights)
@@ -170,12 +158,11 @@ class Planner(nn.Module):
             "columns": eye.unsqueeze(-2).repeat(1, self.m, 1),
             "eye": eye,
             "stiff": 1.0 + cost.damping * eye,
-            "apart": 1.0 - eye,
         }
         for name, values in buffers.items():
             self.register_buffer(name, values)
         hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2, damping=cost.damping)
-        hold_numbers(self, soft=SOFT, blunt=EPS, near=AT_BOUND)
+        hold_numbers(self, soft=SOFT, blunt=EPS)
 
     def forward(
         self,
@@ -237,7 +224,6 @@ class Planner(nn.Module):
         outside its range counts as the end of it.
         """
         stiff = by.stiffness * self.moved + by.rest_weight * self.eye
-        at = applied @ self.first
         held = by.stiffness * (applied @ self.applied) + by.rest_weight * by.rest - by.z_cost
         wanted, weights = torch.minimum(torch.maximum(wanted, by.low), by.high), self.weights * by.track
         # What the operators allow, as far as the MV gets until then; of an MV out of use where it stands.
@@ -245,9 +231,9 @@ class Planner(nn.Module):
             torch.minimum(torch.maximum(end, by.stands - by.reach), by.stands + by.reach)
             for end in (by.z_low, by.z_high)
         )
-        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        assert self.bounded is not None  # of a law with `operate`
         soft, blunt = self.soft + by.blurred, self.blunt + by.blurred
-        for _ in range(self.passes):
+        for i in range(self.passes):
             run = self.horizon(start, plan + by.off, forecast)
             error = run.y - wanted
             weight = weights / torch.sqrt(error * error + self.eps_squared)
@@ -257,10 +243,7 @@ class Planner(nn.Module):
             pull = product(back, run.slopes_t, held)
             before = plan
             curvature, pull = self._damped(run.slopes * both, run.slopes_t, stiff, pull, plan)
-            if self.rate is None:
-                plan = self._descended_within(curvature, pull, plan, middle, half)
-            else:
-                plan = self.descended(curvature, pull, plan, at, (low, high, by.rate))
+            plan = self.bounded(curvature, pull, plan, low, high, swept=i == 0)
         return LastPass(plan, before, run, wanted, weight, push, stiff, low, high)
 
     def _damped(
@@ -278,61 +261,12 @@ class Planner(nn.Module):
         seen = self.damping * (weighed @ slopes_t)
         return product(weighed, slopes_t, stiff) + seen, pull + plan @ seen
 
-    def _along_valley(
-        self, curvature: Tensor, pull: Tensor, plan: Tensor, half: Tensor, t: Tensor, moved: Tensor
-    ) -> Tensor:
-        """The step (..., 1, m) on in the direction that a sweep ``moved`` t: to the least cost, or the nearest bound.
-
-        Where there are more MVs than set points, the cost is flat along the MVs' common moves that no output shows, and
-        sweeps go that way by a few percent each. The least cost along s is at a = (pull - H z) s'/(s H s').
-        """
-        along = half * moved
-        down = ((pull - plan @ curvature) * along).sum(dim=-1, keepdim=True)
-        bend = ((along @ curvature) * along).sum(dim=-1, keepdim=True)
-        length = torch.clamp(down / torch.clamp(bend, min=LEAST_BEND), 0.0, MOST_LENGTH)
-        room = 1.0 - t * torch.sign(moved) + self.near
-        free = (room / torch.clamp(moved.abs(), min=AT_BOUND / MOST_LENGTH)).amin(dim=-1, keepdim=True)
-        return torch.minimum(length, free) * moved
-
-    def _descended_within(self, curvature: Tensor, pull: Tensor, plan: Tensor, middle: Tensor, half: Tensor) -> Tensor:
-        """The minimum of z'Hz/2 - pull z for z = middle + half t, |t| <= 1, from ``plan``; bounds (..., 1, m).
-
-        In t the bounds are numbers, so that a coordinate takes two operators, as without operators' limits.
-        """
-        m = self.m
-        size = torch.clamp(half, min=LEAST_HALF)
-        diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
-        share = curvature / (diagonal * size)  # column p over what makes t_p of it
-        rows = (half * self.eye).sum(dim=-1, keepdim=True)  # half as a column
-        others = rows * share * self.apart
-        g = self.eye - (others + self.eye).unsqueeze(-3) * self.columns
-        c = self.eye * (pull / (diagonal * size) - middle @ share)
-        into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
-        add = torch.split(c, 1, dim=-2)
-        t = (plan - middle) / size
-        for sweep in range(self.sweeps):
-            before = t
-            for p in self.order:
-                t = hardtanh(product(t, into[p], add[p]))
-            if self.valleys and sweep == self.sweeps - 2:
-                t = hardtanh(t + self._along_valley(curvature, pull, middle + half * t, half, t, t - before))
-        return middle + half * t
-
-    def descended(
-        self,
-        curvature: Tensor,
-        pull: Tensor,
-        plan: Tensor,
-        at: Tensor,
-        bounds: tuple[Tensor, Tensor, Tensor] | None = None,
-    ) -> Tensor:
-        """The minimum of z'Hz/2 - pull z within the bounds, from ``plan``: H (..., m, m), the others (..., 1, m).
-
-        ``bounds`` are the least and largest value of each move and its largest difference from the one before; without
-        them all lie within -1..1, and differ by the rate.
+    def descended(self, curvature: Tensor, pull: Tensor, plan: Tensor, at: Tensor) -> Tensor:
+        """The minimum of z'Hz/2 - pull z within -1..1, from ``plan``: H (..., m, m), the others (..., 1, m).
 
         Coordinate p is z_p = (pull_p - sum_{q != p} H_pq z_q)/H_pp, cut to its bounds. Written for the whole row
-        that is z G_p + c_p, where only column p of G_p is not the identity's.
+        that is z G_p + c_p, where only column p of G_p is not the identity's. With a rate each differs from the one
+        before by at most that; the first from the applied MV, ``at`` (..., 1, m).
         """
         m = self.m
         diagonal = (curvature * self.eye).sum(dim=-2, keepdim=True)
@@ -341,22 +275,12 @@ class Planner(nn.Module):
         into = torch.split(g.reshape(*g.shape[:-3], m * m, m), m, dim=-2)
         add = torch.split(c, 1, dim=-2)
         for _ in range(self.sweeps):
-            if bounds is None and self.rate is None:
+            if self.rate is None:
                 for p in range(m):
                     plan = hardtanh(product(plan, into[p], add[p]))
                 continue
-            low, high = self.ends(product(plan, self.before, at), bounds)
+            middle = product(plan, self.before, at)
+            low, high = (torch.clamp(middle + by, -1.0, 1.0) for by in (-self.rate, self.rate))
             for p in range(m):
                 plan = torch.minimum(torch.maximum(product(plan, into[p], add[p]), low), high)
         return plan
-
-    def ends(self, middle: Tensor, bounds: tuple[Tensor, Tensor, Tensor] | None) -> tuple[Tensor, Tensor]:
-        """The ends of each move, whose move before is at ``middle`` (..., 1, m); ``bounds`` as in ``descended``."""
-        if bounds is not None:
-            least, most, rate = bounds
-            return (
-                torch.minimum(torch.maximum(middle - rate, least), most),
-                torch.minimum(torch.maximum(middle + rate, least), most),
-            )
-        assert self.rate is not None  # without a rate the ends are numbers
-        return torch.clamp(middle - self.rate, -1.0, 1.0), torch.clamp(middle + self.rate, -1.0, 1.0)
