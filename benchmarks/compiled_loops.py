@@ -1,0 +1,137 @@
+"""Loops a second of ``loopwright stress``: the law stepped by onnxruntime, and by its compiled plain C.
+
+``python benchmarks/compiled_loops.py [FILE.onnx ...] [--rounds N] [--seconds S]``: for each file, in rounds by turns,
+loops a second of one process with onnxruntime and with the C, their ratio (the median of the rounds), the seconds until
+the C can step (text, compiler, gate; nothing is kept), and those where it was kept. ``--levels -O1 -O2 -O3`` puts the
+compiler's levels beside each other.
+
+``--verdicts N``: the same N loops by both instead, how many verdicts differ, and by how much the figures do.
+``--kit``: the largest difference between both over the conformance kit of each file instead, all shipped ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.evaluation.stress.draws import Drawing
+from loopwright.pipeline.evaluation.stress.loops import Stress, StressOutcome
+from loopwright.pipeline.export.plain_code.compiled_law import LEVEL, compiled_law
+from loopwright.serving import Controller
+
+ARTIFACTS = Path(__file__).parents[1] / "artifacts"
+FILES = (
+    "ph_neutralization/pid", "thiosulfate_cstr/inc", "ph_neutralization/predictive", "henson_seborg_cstr/predictive",
+)  # fmt: skip
+FEWEST = 4  # loops of a turn
+BATCH = 100  # loops side by side, as in the command
+
+
+def by_onnx(file: Path) -> Stress:
+    """The loops of a shipped file, stepped by onnxruntime."""
+    return Stress(Drawing(CASES[file.parent.name]), file.read_bytes())
+
+
+def by_c(file: Path, level: str = LEVEL) -> tuple[Stress, float]:
+    """The same, stepped by compiled C, and the seconds until it can."""
+    controller, begun = Controller(file), time.perf_counter()
+    law = compiled_law(controller, level)
+    taken = time.perf_counter() - begun
+    return Stress(Drawing(CASES[file.parent.name]), file.read_bytes(), compute=law.compute), taken
+
+
+def rate(stress: Stress, loops: int) -> float:
+    """Loops a second of ``loops`` loops, in batches as those of the command."""
+    begun = time.perf_counter()
+    for first in range(0, loops, BATCH):
+        stress.outcomes(range(first, min(first + BATCH, loops)))
+    return loops / (time.perf_counter() - begun)
+
+
+def loops_in(stress: Stress, seconds: float) -> int:
+    """Loops that take about ``seconds``; a first few make session, plant and library ready."""
+    rate(stress, FEWEST)
+    return max(FEWEST, min(BATCH, math.ceil(seconds * rate(stress, FEWEST))))
+
+
+def compare(file: Path, rounds: int, seconds: float, levels: list[str]) -> None:
+    """Print a row for each level."""
+    sides = {level: by_c(file, level) for level in levels}
+    kept = {level: by_c(file, level)[1] for level in levels}
+    stresses = {"onnx": by_onnx(file), **{level: stress for level, (stress, _) in sides.items()}}
+    # The same loops on all sides: some tests of a case are longer than others.
+    loops = loops_in(stresses["onnx"], seconds)
+    for stress in stresses.values():
+        rate(stress, FEWEST)
+    rates: dict[str, list[float]] = {side: [] for side in stresses}
+    for _ in range(rounds):
+        for side, stress in stresses.items():
+            rates[side].append(rate(stress, loops))
+    before = statistics.median(rates["onnx"])
+    for level in levels:
+        ratio = statistics.median(c / onnx for c, onnx in zip(rates[level], rates["onnx"], strict=True))
+        print(
+            f"{file.parent.name}/{file.stem:14s} {level} {loops:4d} loops: {before:8.2f} loops/s by onnxruntime, "
+            f"{statistics.median(rates[level]):8.2f} by C, {ratio:5.2f} times; "
+            f"{sides[level][1]:5.2f} s until the C can step, {kept[level]:5.2f} s where it was kept",
+            flush=True,
+        )
+
+
+def verdict(one: StressOutcome) -> tuple[bool, ...]:
+    """The part of an outcome that is no number."""
+    return one.locked_up, one.left_limits, one.refused > 0, one.broke, one.swings
+
+
+def parted(a: StressOutcome, b: StressOutcome) -> float:
+    """The largest relative difference of the figures of one loop."""
+    pairs = [(a.figures[name], b.figures[name]) for name in a.figures]
+    return max((abs(x - y) / max(abs(x), abs(y)) for x, y in pairs if x != y), default=0.0)
+
+
+def verdicts(file: Path, loops: int) -> None:
+    """Print how the same loops end by onnxruntime and by C."""
+    onnx, c = by_onnx(file).outcomes(range(loops)), by_c(file)[0].outcomes(range(loops))
+    differ = [a.index for a, b in zip(onnx, c, strict=True) if verdict(a) != verdict(b)]
+    failed = [a.index for a, b in zip(onnx, c, strict=True) if a.failed != b.failed]
+    gaps = sorted(parted(a, b) for a, b in zip(onnx, c, strict=True))
+    print(
+        f"{file.parent.name}/{file.stem:14s} {loops} loops: {len(failed)} fail by one alone, {len(differ)} verdicts "
+        f"differ (swings included) {differ[:10]}; figures differ by {statistics.median(gaps):.1e} in the median loop, "
+        f"{gaps[-1]:.1e} in the worst, by more than 1e-6 in {sum(gap > 1e-6 for gap in gaps)}",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print the rows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("files", metavar="FILE.onnx", type=Path, nargs="*")
+    parser.add_argument("--rounds", type=int, default=5, help="by turns (5)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="about, of a turn of onnxruntime (3)")
+    parser.add_argument("--levels", nargs="+", default=[LEVEL], help=f"of the compiler ({LEVEL})")
+    parser.add_argument("--verdicts", metavar="N", type=int, default=0, help="loops whose ends are compared")
+    parser.add_argument("--kit", action="store_true", help="differences over the conformance kits")
+    options = parser.parse_args()
+    shipped = [f for f in sorted(ARTIFACTS.glob("*/*.onnx")) if f.parent.name in CASES and ".explain" not in f.name]
+    every = options.files or (shipped if options.kit else [ARTIFACTS / f"{name}.onnx" for name in FILES])
+    with tempfile.TemporaryDirectory() as kept:
+        os.environ["XDG_CACHE_HOME"] = kept  # nothing is kept from an earlier run
+        for file in every:
+            if options.kit:
+                law = compiled_law(Controller(file))
+                print(f"{file.parent.name}/{file.stem:28s} {law.worst:.1e}", flush=True)
+            elif options.verdicts:
+                verdicts(file, options.verdicts)
+            else:
+                compare(file, options.rounds, options.seconds, options.levels)
+
+
+if __name__ == "__main__":
+    main()
