@@ -2,10 +2,11 @@
 
 ``python benchmarks/compiled_loops.py [FILE.onnx ...] [--rounds N] [--seconds S]``: for each file, in rounds by turns,
 loops a second of one process with onnxruntime and with the C, their ratio (the median of the rounds), the seconds until
-the C can step (text, compiler, gate; nothing is kept), and those where it was kept. ``--levels -O1 -O2 -O3`` puts the
-compiler's levels beside each other.
+the C can step (text, compiler, gate; nothing is kept), and those where it was kept. ``--levels 1 2 3`` puts the
+compiler's levels -O1, -O2 and -O3 beside each other.
 
-``--verdicts N``: the same N loops by both instead, how many verdicts differ, and by how much the figures do.
+``--verdicts N``: the same N loops by both instead, how many verdicts differ, and by how much the figures do; and the
+same for onnxruntime whose MV is off by up to 1e-12 of its range at each step, which says how much a loop amplifies.
 ``--kit``: the largest difference between both over the conformance kit of each file instead, all shipped ones.
 """
 
@@ -17,7 +18,10 @@ import os
 import statistics
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.evaluation.stress.draws import Drawing
@@ -30,6 +34,7 @@ FILES = (
     "ph_neutralization/pid", "thiosulfate_cstr/inc", "ph_neutralization/predictive", "henson_seborg_cstr/predictive",
 )  # fmt: skip
 FEWEST = 4  # loops of a turn
+NUDGE = 1e-12  # of an MV's range: above rounding's 2e-16, and below what the gate allows
 BATCH = 100  # loops side by side, as in the command
 
 
@@ -90,23 +95,43 @@ def verdict(one: StressOutcome) -> tuple[bool, ...]:
 
 
 def parted(a: StressOutcome, b: StressOutcome) -> float:
-    """The largest relative difference of the figures of one loop."""
+    """The largest relative difference of the figures of one loop; infinite where one of both broke."""
+    if a.broke or b.broke:
+        return 0.0 if a.broke and b.broke else math.inf
     pairs = [(a.figures[name], b.figures[name]) for name in a.figures]
     return max((abs(x - y) / max(abs(x), abs(y)) for x, y in pairs if x != y), default=0.0)
 
 
+def nudged(file: Path) -> Stress:
+    """The loops by onnxruntime with other last digits."""
+    controller, rng = Controller(file), np.random.default_rng(0)
+    signals, place = controller.manifest.mv, controller.places["mv"]
+    sizes = np.array([0.0 if s.values else NUDGE * (s.high - s.low) for s in signals])
+    low, high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
+
+    def compute(given: np.ndarray) -> np.ndarray:
+        taken = controller.compute(given)
+        mv = taken[:, place]
+        taken[:, place] = np.clip(mv + sizes * rng.uniform(-1, 1, mv.shape), low, high)
+        return taken
+
+    return replace(by_onnx(file), compute=compute)
+
+
 def verdicts(file: Path, loops: int) -> None:
-    """Print how the same loops end by onnxruntime and by C."""
-    onnx, c = by_onnx(file).outcomes(range(loops)), by_c(file)[0].outcomes(range(loops))
-    differ = [a.index for a, b in zip(onnx, c, strict=True) if verdict(a) != verdict(b)]
-    failed = [a.index for a, b in zip(onnx, c, strict=True) if a.failed != b.failed]
-    gaps = sorted(parted(a, b) for a, b in zip(onnx, c, strict=True))
-    print(
-        f"{file.parent.name}/{file.stem:14s} {loops} loops: {len(failed)} fail by one alone, {len(differ)} verdicts "
-        f"differ (swings included) {differ[:10]}; figures differ by {statistics.median(gaps):.1e} in the median loop, "
-        f"{gaps[-1]:.1e} in the worst, by more than 1e-6 in {sum(gap > 1e-6 for gap in gaps)}",
-        flush=True,
-    )
+    """Print how the same loops end by onnxruntime, by C, and by onnxruntime with other last digits."""
+    onnx = by_onnx(file).outcomes(range(loops))
+    for side, stress in (("C", by_c(file)[0]), (f"{NUDGE:g} off", nudged(file))):
+        pairs = list(zip(onnx, stress.outcomes(range(loops)), strict=True))
+        failed, differ = ([a.index for a, b in pairs if of(a) != of(b)] for of in (lambda one: one.failed, verdict))
+        gaps = sorted(parted(a, b) for a, b in pairs)
+        name = f"{file.parent.name}/{file.stem:14s} {side:9s}"
+        print(
+            f"{name} {loops} loops: {len(failed)} fail by one alone, {len(differ)} "
+            f"verdicts differ, swings included {differ[:10]}; figures differ by {statistics.median(gaps):.1e} in the "
+            f"median loop, {gaps[-1]:.1e} in the worst, by more than 1e-6 in {sum(gap > 1e-6 for gap in gaps)}",
+            flush=True,
+        )
 
 
 def main() -> None:
@@ -115,7 +140,7 @@ def main() -> None:
     parser.add_argument("files", metavar="FILE.onnx", type=Path, nargs="*")
     parser.add_argument("--rounds", type=int, default=5, help="by turns (5)")
     parser.add_argument("--seconds", type=float, default=3.0, help="about, of a turn of onnxruntime (3)")
-    parser.add_argument("--levels", nargs="+", default=[LEVEL], help=f"of the compiler ({LEVEL})")
+    parser.add_argument("--levels", nargs="+", type="-O{}".format, default=[LEVEL], help=f"of the compiler ({LEVEL})")
     parser.add_argument("--verdicts", metavar="N", type=int, default=0, help="loops whose ends are compared")
     parser.add_argument("--kit", action="store_true", help="differences over the conformance kits")
     options = parser.parse_args()
