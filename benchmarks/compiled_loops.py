@@ -7,6 +7,8 @@ compiler's levels -O1, -O2 and -O3 beside each other.
 
 ``--verdicts N``: the same N loops by both instead, how many verdicts differ, and by how much the figures do; and the
 same for onnxruntime whose MV is off by up to 1e-12 of its range at each step, which says how much a loop amplifies.
+``--search``: the seconds in which the search for the numbers of a PID runs all its candidates as torch, side by side,
+and those until the C of a single candidate can step instead.
 ``--kit``: the largest difference between both over the conformance kit of each file instead, all shipped ones.
 """
 
@@ -20,13 +22,17 @@ import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.evaluation.stress.draws import Drawing
 from loopwright.pipeline.evaluation.stress.loops import Stress, StressOutcome
+from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.export.plain_code.compiled_law import LEVEL, compiled_law
+from loopwright.pipeline.laws import LAWS
+from loopwright.pipeline.tuning.loop_search import DevelopmentLoops, LawStep, LoopCosts
 from loopwright.serving import Controller
 
 ARTIFACTS = Path(__file__).parents[1] / "artifacts"
@@ -134,6 +140,39 @@ def verdicts(file: Path, loops: int) -> None:
         )
 
 
+def search() -> None:
+    """Print how long candidates of a PID take as they are, and how long one takes to become C."""
+    law, case = LAWS["pid"], CASES["ph_neutralization"]
+    taken: list[tuple[int, float]] = []
+
+    class Timed(DevelopmentLoops):
+        """Development loops that keep how many candidates ran, and for how long."""
+
+        def run(self, step: LawStep, n_state: int, candidates: int = 1, *, time_weighted: bool = False) -> LoopCosts:
+            begun = time.perf_counter()
+            found = super().run(step, n_state, candidates, time_weighted=time_weighted)
+            taken.append((candidates, time.perf_counter() - begun))
+            return found
+
+    params = law.Params(tuning="optimized", criterion="itae", development_seeds=(7001, 7002, 7003), development_hold=60)
+    with (
+        mock.patch("loopwright.pipeline.laws.pid.tuned.DevelopmentLoops", Timed),
+        tempfile.TemporaryDirectory() as made,
+    ):
+        designed = law.design(params, {}, case.plant.signals, case.plant).eval()
+        for name in ("first", "second"):  # the first export loads what the others find
+            begun, file = time.perf_counter(), Path(made) / f"{name}.onnx"
+            export(designed, file, case=case.name, provenance={})
+            exported = time.perf_counter()
+            compiled_law(Controller(file))
+            ended = time.perf_counter()
+    candidates, seconds = (sum(column) for column in zip(*taken, strict=True))
+    print(
+        f"{candidates} candidates over {len(params.development_seeds)} sequences as torch: {seconds:.2f} s; one "
+        f"candidate until its C can step: {exported - begun:.2f} s for its file, {ended - exported:.2f} s for its C"
+    )
+
+
 def main() -> None:
     """Print the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -143,11 +182,15 @@ def main() -> None:
     parser.add_argument("--levels", nargs="+", type="-O{}".format, default=[LEVEL], help=f"of the compiler ({LEVEL})")
     parser.add_argument("--verdicts", metavar="N", type=int, default=0, help="loops whose ends are compared")
     parser.add_argument("--kit", action="store_true", help="differences over the conformance kits")
+    parser.add_argument("--search", action="store_true", help="a PID's search beside the making of its C")
     options = parser.parse_args()
     shipped = [f for f in sorted(ARTIFACTS.glob("*/*.onnx")) if f.parent.name in CASES and ".explain" not in f.name]
     every = options.files or (shipped if options.kit else [ARTIFACTS / f"{name}.onnx" for name in FILES])
     with tempfile.TemporaryDirectory() as kept:
         os.environ["XDG_CACHE_HOME"] = kept  # nothing is kept from an earlier run
+        if options.search:
+            search()
+            return
         for file in every:
             if options.kit:
                 law = compiled_law(Controller(file))

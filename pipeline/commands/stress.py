@@ -53,7 +53,7 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--batch", metavar="N", type=whole(1), default=STRESS_BATCH, help=f"loops of a piece of work ({STRESS_BATCH})")
     add("--out", metavar="FOLDER", type=Path, help="where the report goes (CASE-LAW-stress)")
     add("--law-by", choices=LAW_BY, default=LAW_BY[0],
-        help=f"what steps the law: its plain C, onnxruntime, or c where it can be had ({LAW_BY[0]})")  # fmt: skip
+        help=f"steps of the law: c, its plain C; onnx, onnxruntime; auto, c where it can be ({LAW_BY[0]})")  # fmt: skip
     add("--replay", metavar="INDEX", type=whole(0), help="run one loop again, and draw it")
 
 

@@ -36,7 +36,8 @@ from loopwright.serving.vectorized_controller import ComputeRows
 Array = NDArray[np.float64]
 
 LAW = "law"  # the name of the step in C
-# -O2: a predictive law compiles in 1.8 s and -O3 in 5.4 s, for loops of the same speed (benchmarks/compiled_loops.py).
+# A predictive law: -O1, -O2 and -O3 compile in .8, 1.8 and 5.4 s, and give 104, 109 and 114 loops a second
+# (benchmarks/compiled_loops.py --levels 1 2 3); loops of other laws differ no more.
 LEVEL = "-O2"
 FLAGS = ("-std=c99", "-ffp-contract=off", "-fPIC", "-shared")
 LINKED = ("-lm",)
@@ -77,7 +78,7 @@ class CompiledLaw:
 
 @dataclass(frozen=True)
 class LawStepping:
-    """What computes the steps of a controller in a simulation: ``compute``, None: its session; and ``words`` for it."""
+    """Host of a controller's steps in a simulation: ``compute``, None: the session; ``words`` name it for a person."""
 
     compute: ComputeRows | None
     words: str
