@@ -1,6 +1,6 @@
 """Loops a second of ``loopwright stress``: the law stepped by onnxruntime, and by its compiled plain C.
 
-``python benchmarks/compiled_loops.py [FILE.onnx ...] [--rounds N] [--seconds S]``: for each file, in rounds by turns,
+``python benchmarks/compiled_loops.py [FILE.onnx ...] [--rounds N] [--loops N]``: for each file, in rounds by turns,
 loops a second of one process with onnxruntime and with the C, their ratio (the median of the rounds), the seconds until
 the C can step (text, compiler, gate; nothing is kept), and those where it was kept. ``--levels 1 2 3`` puts the
 compiler's levels -O1, -O2 and -O3 beside each other.
@@ -36,10 +36,11 @@ from loopwright.pipeline.tuning.loop_search import DevelopmentLoops, LawStep, Lo
 from loopwright.serving import Controller
 
 ARTIFACTS = Path(__file__).parents[1] / "artifacts"
-FILES = (
-    "ph_neutralization/pid", "thiosulfate_cstr/inc", "ph_neutralization/predictive", "henson_seborg_cstr/predictive",
-)  # fmt: skip
-FEWEST = 4  # loops of a turn
+# Loops of a turn: all that the command steps side by side, but of the slow ones.
+LOOPS = {
+    "ph_neutralization/pid": 100, "thiosulfate_cstr/inc": 100, "ph_neutralization/predictive": 100,
+    "henson_seborg_cstr/predictive": 10,
+}  # fmt: skip
 NUDGE = 1e-12  # of an MV's range: above rounding's 2e-16, and below what the gate allows
 BATCH = 100  # loops side by side, as in the command
 
@@ -65,21 +66,13 @@ def rate(stress: Stress, loops: int) -> float:
     return loops / (time.perf_counter() - begun)
 
 
-def loops_in(stress: Stress, seconds: float) -> int:
-    """Loops that take about ``seconds``; a first few make session, plant and library ready."""
-    rate(stress, FEWEST)
-    return max(FEWEST, min(BATCH, math.ceil(seconds * rate(stress, FEWEST))))
-
-
-def compare(file: Path, rounds: int, seconds: float, levels: list[str]) -> None:
+def compare(file: Path, rounds: int, loops: int, levels: list[str]) -> None:
     """Print a row for each level."""
     sides = {level: by_c(file, level) for level in levels}
     kept = {level: by_c(file, level)[1] for level in levels}
     stresses = {"onnx": by_onnx(file), **{level: stress for level, (stress, _) in sides.items()}}
-    # The same loops on all sides: some tests of a case are longer than others.
-    loops = loops_in(stresses["onnx"], seconds)
     for stress in stresses.values():
-        rate(stress, FEWEST)
+        rate(stress, 2)  # makes session, plant and library ready
     rates: dict[str, list[float]] = {side: [] for side in stresses}
     for _ in range(rounds):
         for side, stress in stresses.items():
@@ -178,14 +171,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", metavar="FILE.onnx", type=Path, nargs="*")
     parser.add_argument("--rounds", type=int, default=5, help="by turns (5)")
-    parser.add_argument("--seconds", type=float, default=3.0, help="about, of a turn of onnxruntime (3)")
+    parser.add_argument("--loops", type=int, default=0, help="of a turn, the same ones each time (10 to 100, by file)")
     parser.add_argument("--levels", nargs="+", type="-O{}".format, default=[LEVEL], help=f"of the compiler ({LEVEL})")
     parser.add_argument("--verdicts", metavar="N", type=int, default=0, help="loops whose ends are compared")
     parser.add_argument("--kit", action="store_true", help="differences over the conformance kits")
     parser.add_argument("--search", action="store_true", help="a PID's search beside the making of its C")
     options = parser.parse_args()
     shipped = [f for f in sorted(ARTIFACTS.glob("*/*.onnx")) if f.parent.name in CASES and ".explain" not in f.name]
-    every = options.files or (shipped if options.kit else [ARTIFACTS / f"{name}.onnx" for name in FILES])
+    every = options.files or (shipped if options.kit else [ARTIFACTS / f"{name}.onnx" for name in LOOPS])
     with tempfile.TemporaryDirectory() as kept:
         os.environ["XDG_CACHE_HOME"] = kept  # nothing is kept from an earlier run
         if options.search:
@@ -198,7 +191,8 @@ def main() -> None:
             elif options.verdicts:
                 verdicts(file, options.verdicts)
             else:
-                compare(file, options.rounds, options.seconds, options.levels)
+                loops = options.loops or LOOPS.get(f"{file.parent.name}/{file.stem}", BATCH)
+                compare(file, options.rounds, loops, options.levels)
 
 
 if __name__ == "__main__":
