@@ -76,6 +76,12 @@ def read_json(path: Path) -> Any:
         raise PipelineError(f"{path} cannot be read ({error}); run the stages before this one: dvc repro") from None
 
 
+def kept_folder(name: str) -> Path:
+    """The folder of this user for what takes long to fetch or to make, and can be had again; it need not be there."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache) / "loopwright" / name
+
+
 def digest(content: Any) -> str:
     """sha256 of JSON-ready content, however its keys are ordered; what JSON does not know counts as its text."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()

@@ -188,13 +188,13 @@ class Controller:
 
     @property
     def places(self) -> dict[str, slice]:
-        """The numbers of each input, of ``mv`` and of ``state_next`` in the rows that ``compute`` takes and gives."""
-        n_mv, a, b, *_ = self._cuts
+        """The numbers of each input, and of ``mv``, ``state_next`` and ``info``, in the rows of ``compute``."""
+        n_mv, a, b, c, d = self._cuts
         starts = {
             name: ((part.ctypes.data - self._in.ctypes.data) // 8, len(part)) for _, name, part, _ in self._inputs
         }
         inputs = {name: slice(at, at + n) for name, (at, n) in starts.items()}
-        return {**inputs, "mv": slice(0, n_mv), "state_next": slice(a, b)}
+        return {**inputs, "mv": slice(0, n_mv), "state_next": slice(a, b), "info": slice(c, d)}
 
     def compute(self, given: Array) -> Array:
         """The graph's outputs (n, n_out) of rows (n, n_in), one after the other, with none of the checks of ``step``.
@@ -216,6 +216,11 @@ class Controller:
     def width(self) -> int:
         """Numbers of a row that ``compute`` takes."""
         return len(self._in)
+
+    @property
+    def width_out(self) -> int:
+        """Numbers of a row that ``compute`` gives."""
+        return len(self._out)
 
     def warm(self) -> None:
         """Two discarded steps on the last inputs: just before a deadline they bring code and weights into the caches.

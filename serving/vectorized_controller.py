@@ -14,6 +14,8 @@ from loopwright.serving.errors import ContractError
 from loopwright.serving.operating import Operate
 from loopwright.serving.preview.differences import Differences
 
+ComputeRows = Callable[[Array], Array]
+"""The graph's outputs (n, n_out) of rows (n, n_in), as ``Controller.compute`` gives them: nan for a row not finite."""
 STEERING = frozenset({"operate", "fresh", "ahead"})  # inputs with defaults
 
 
@@ -31,13 +33,16 @@ class VectorizedController:
     The graph is the one that the controller steps, in the same session and the same buffers, one row after the other:
     a row's numbers are those of ``Controller.step``, bit for bit. The checks of shapes, finite numbers and ranges are
     made for all rows at once, which is what makes it faster.
+
+    ``compute`` may be another host of the same law, such as its plain C; None: the controller's session.
     """
 
-    def __init__(self, controller: Controller, n: int) -> None:
+    def __init__(self, controller: Controller, n: int, compute: ComputeRows | None = None) -> None:
         self.controller, self.n = controller, n
+        self._compute = controller.compute if compute is None else compute
         places = controller.places
-        self._mv, self._next = places.pop("mv"), places.pop("state_next")
-        self._places = places
+        self._mv, self._next = places["mv"], places["state_next"]
+        self._places = {name: places[name] for name in controller.manifest.inputs}
         self._given = np.zeros((n, controller.width))
         m = controller.manifest
         self._operate = Operate(m.operate)
@@ -87,7 +92,7 @@ class VectorizedController:
             if name in STEERING:
                 self._require_allowed(name, given)
             self._given[:, place] = given[name]
-        taken = self.controller.compute(self._given)
+        taken = self._compute(self._given)
         mv = taken[:, self._mv].copy()
         allowed: NDArray[np.bool_] = np.all(np.isfinite(taken), axis=1)
         for signal, moved, applied in zip(self.controller.manifest.mv, mv.T, mv_applied.T, strict=True):

@@ -20,6 +20,7 @@ from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.stress.draws import Drawing
 from loopwright.pipeline.evaluation.stress.loops import Stress, StressOutcome, figures_of, opened
 from loopwright.pipeline.evaluation.stress.summary import Summary
+from loopwright.pipeline.export.plain_code.compiled_law import LAW_BY, law_stepping
 from loopwright.pipeline.pictures.drawing import save
 from loopwright.pipeline.pictures.numbers import number
 from loopwright.pipeline.pictures.stress_pictures import loop_canvas
@@ -51,6 +52,8 @@ def options(parser: argparse.ArgumentParser) -> None:
     add("--workers", metavar="N", type=whole(1), help="processes side by side (one a core)")
     add("--batch", metavar="N", type=whole(1), default=STRESS_BATCH, help=f"loops of a piece of work ({STRESS_BATCH})")
     add("--out", metavar="FOLDER", type=Path, help="where the report goes (CASE-LAW-stress)")
+    add("--law-by", choices=LAW_BY, default=LAW_BY[0],
+        help=f"steps of the law: c, its plain C; onnx, onnxruntime; auto, c where it can be ({LAW_BY[0]})")  # fmt: skip
     add("--replay", metavar="INDEX", type=whole(0), help="run one loop again, and draw it")
 
 
@@ -64,17 +67,19 @@ def _operated(text: str) -> TimedValue:
 def run(options: argparse.Namespace) -> None:
     """Run the loops and write their report; or one of them again."""
     require_shipped(options.file)
-    manifest, content = opened(options.file)
-    case = _case_of(manifest)
+    controller, content = opened(options.file)
+    case = _case_of(controller.manifest)
     drawing = Drawing(case, options.seed, options.spread / 100, options.faults / 100)
     operate = at_once(options.operate)
-    Operate(manifest.operate).with_values(operate)  # an error comes before any work
-    stress = Stress(drawing, content, tuple(operate.items()))
+    Operate(controller.manifest.operate).with_values(operate)  # an error comes before any work
     for tests in drawing.tests.values():
         for test in tests:
             drawing.ranges(drawing.plant_of(test))
+    stepping = law_stepping(controller, options.law_by)
+    stress = Stress(drawing, content, tuple(operate.items()), stepping.compute)
     if options.replay is not None:
         _replay(stress, options)
+        print(f"law stepped by {stepping.words}")
         return
     out = options.out or Path(f"{case.name}-{options.file.stem}-stress")
     _check_folder(out)
@@ -82,10 +87,11 @@ def run(options: argparse.Namespace) -> None:
     outcomes = outcomes_of(stress, options.plants, options.batch, options.workers)
     taken = time.perf_counter() - begun
     summary = Summary(case, options.file.stem, drawing.draws(range(options.plants)), outcomes)
-    write_stress(StressRun(options.file, stress, summary, _options(options)), out)
+    write_stress(StressRun(options.file, stress, summary, _options(options), stepping.words), out)
     (spread, *_) = [s for s in summary.spreads() if not s.test and s.metric == case.metric]
     low, median, *_, worst = spread.values
     print(f"{options.plants} loops in {taken:.1f} s ({options.plants / taken:.3g} a second)")
+    print(f"law stepped by {stepping.words}")
     errors = figures_of(outcomes, case.metric)
     print(
         f"{case.label(case.metric)}: median {number(median)}, 5 % below {number(low)}, worst {number(worst)} "
@@ -156,4 +162,5 @@ def _options(options: argparse.Namespace) -> str:
         "faults": (options.faults, STRESS_FAULTS),
     }
     drawn = "".join(f" --{name} {value!r}" for name, (value, default) in given.items() if value != default)
+    drawn += f" --law-by {options.law_by}" if options.law_by != LAW_BY[0] else ""
     return drawn + "".join(f" --operate {shlex.quote(f'{e.name}={e.value!r}')}" for e in options.operate)

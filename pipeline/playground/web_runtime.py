@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -13,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from loopwright.pipeline.errors import PipelineError
-from loopwright.pipeline.files import draft_folder_of, sha256
+from loopwright.pipeline.files import draft_folder_of, kept_folder, sha256
 
 VERSION = "1.30.0"  # as in npm/package.json
 MODULE, WASM = "ort.wasm.bundle.min.mjs", "ort-wasm-simd-threaded.wasm"
@@ -29,8 +28,7 @@ NPM_PATIENCE_S = 600.0  # [s] that npm may take
 
 def kept() -> Path:
     """The folder that holds the files once they were fetched."""
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(cache) / "loopwright" / f"onnxruntime-web-{VERSION}"
+    return kept_folder(f"onnxruntime-web-{VERSION}")
 
 
 def web_runtime(given: Path | None = None) -> Path:

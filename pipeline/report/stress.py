@@ -29,6 +29,7 @@ class StressRun:
     stress: Stress
     summary: Summary
     options: str  # of the command, without the file: what a replay needs
+    stepped_by: str  # what computed the steps of the law
 
     def replay(self, index: int) -> str:
         """The command that runs one loop again."""
@@ -87,6 +88,7 @@ def write_stress(run: StressRun, out: Path) -> list[Path]:
         "stroke": STROKE,
         "stuck": tuple(100 * s for s in STUCK_FOR),
         "table": TABLE,
+        "stepped_by": run.stepped_by,
     }  # fmt: skip
     _write_table(out / TABLE, table(summary.draws, summary.outcomes), run)
     pages = write_pages(
@@ -133,6 +135,7 @@ def _write_table(path: Path, columns: Mapping[str, list[object]], run: StressRun
     import pyarrow.parquet as pq
 
     told = {"loopwright.stress": run.replay(-1).replace("--replay -1", "").replace("  ", " ")}
+    told["loopwright.stepped_by"] = run.stepped_by
     told["loopwright.sha256"] = run.stress.controller.sha256
     with draft_of(path) as draft:
         pq.write_table(pa.table(dict(columns)).replace_schema_metadata(told), draft)

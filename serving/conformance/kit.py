@@ -109,7 +109,7 @@ def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
 def vectors_of(controller: Controller) -> dict[str, Any]:
     """The content of ``vectors.json``, ready for JSON."""
     m, steps, scans, begin = controller.manifest, answered(controller), scanned(controller), start(controller.manifest)
-    scale = _scale(controller, steps)
+    scale = entry_scale(controller, steps)
     begins = beginnings(controller, steps, scale, CHAIN_TOLERANCE / KIT_TOLERANCE)
     return {
         "kit": KIT,
@@ -144,7 +144,7 @@ def vectors_of(controller: Controller) -> dict[str, Any]:
     }
 
 
-def _scale(controller: Controller, answers: list[StepResult]) -> dict[str, Array]:
+def entry_scale(controller: Controller, answers: list[StepResult]) -> dict[str, Array]:
     """By what each entry's difference is divided: an MV's range, else the entry's largest magnitude in the vectors."""
     taken = [answer.step for answer in answers if answer.step is not None]
     scale = {"mv": np.array([s.high - s.low for s in controller.manifest.mv], dtype=np.float64)}

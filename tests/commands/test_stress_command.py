@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from html import unescape
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -18,6 +19,7 @@ PH = ROOT / "artifacts/ph_neutralization/pid.onnx"
 @pytest.fixture(autouse=True)
 def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / ".cache"))  # of the compiled law
 
 
 def test_the_report_names_the_worst_and_how_to_run_them_again(capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,6 +52,7 @@ def test_the_report_names_the_worst_and_how_to_run_them_again(capsys: pytest.Cap
         (["--seed", "-1"], "'-1' is not allowed"),
         (["--faults", "101"], "'101' is not allowed; give a percentage from 0 to 100"),
         (["--spread", "nan"], "'nan' is not allowed"),
+        (["--law-by", "java"], "invalid choice"),
         (["--operate", "u.high"], "'u.high' is not of the form NAME=VALUE"),
     ],
 )
@@ -60,6 +63,48 @@ def test_what_is_no_number_is_refused(options: list[str], words: str, capsys: py
     said = capsys.readouterr().err
     assert words in said
     assert said.count("\n") == 1
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler (Debian: apt install gcc)")
+def test_loops_by_plain_c_are_those_by_onnxruntime(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    draw_nothing(monkeypatch)
+    rows, said = {}, {}
+    for law_by in ("onnx", "c", "auto"):
+        options = ["--plants", "20", "--seed", "3", "--out", law_by, "--law-by", law_by]
+        assert main(["stress", str(PH), *options]) == 0
+        (said[law_by],) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("law stepped by ")]
+        table = pq.read_table(f"{law_by}/plants.parquet")
+        stepped_by = table.schema.metadata[b"loopwright.stepped_by"].decode()
+        assert said[law_by] == f"law stepped by {stepped_by}"
+        pages = [unescape(Path(law_by, f"report.{kind}").read_text("utf-8")) for kind in ("md", "html")]
+        assert all(stepped_by in page for page in pages)
+        assert all((f" --law-by {law_by}" in page) == (law_by != "auto") for page in pages)
+        rows[law_by] = table.to_pylist()
+    assert said["onnx"].startswith("law stepped by onnxruntime ")
+    assert said["c"] == said["auto"]
+    assert said["c"].startswith("law stepped by plain C, ")
+    assert rows["c"] == rows["auto"]
+    assert rows["c"] != rows["onnx"]  # last digits: else onnxruntime has stepped both
+    for one, other in zip(rows["c"], rows["onnx"], strict=True):
+        numbers = {name for name, value in one.items() if isinstance(value, float)}
+        assert {name: one[name] for name in numbers} == pytest.approx({n: other[n] for n in numbers}, rel=1e-9)
+        assert {k: v for k, v in one.items() if k not in numbers} == {k: other[k] for k in other if k not in numbers}
+
+
+def test_without_a_compiler_onnxruntime_steps_and_c_is_one_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    draw_nothing(monkeypatch)
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert main(["stress", str(PH), "--plants", "2", "--out", "out"]) == 0
+    assert "law stepped by onnxruntime " in capsys.readouterr().out
+    assert main(["stress", str(PH), "--plants", "2", "--out", "none", "--law-by", "c"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("loopwright stress: no C compiler is installed: CC names 'no-such-compiler'")
+    assert error.count("\n") == 1
+    assert not Path("none").exists()
 
 
 def test_a_law_that_operators_do_not_steer_takes_no_operate(capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,9 +19,8 @@ from loopwright.pipeline.plants.identified import IdentifiedPlant, StateEquation
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.simulate import Trajectory
 from loopwright.serving.controller import Controller
-from loopwright.serving.manifest import Manifest
 from loopwright.serving.operating import Operate
-from loopwright.serving.vectorized_controller import VectorizedController
+from loopwright.serving.vectorized_controller import ComputeRows, VectorizedController
 
 AdvanceRows = Callable[[Array, Array, Array, Array], Array]
 """``advance(x (n, n_x), mv (n, n_mv), dv (n, n_dv), p (n, n_p)) -> x (n, n_x)`` one period later."""
@@ -113,12 +112,14 @@ class StressOutcome:
 class Stress:
     """The needs of a worker for a batch of loops: how they are drawn, and the bytes of the controller file.
 
-    ``operate`` holds the values, by name, of what operators have changed; the rest are the file's defaults.
+    ``operate`` holds the values, by name, of what operators have changed; the rest are the file's defaults. ``compute``
+    computes the steps in place of the controller's session, and goes to the workers with all else.
     """
 
     drawing: Drawing
     content: bytes
     operate: tuple[tuple[str, float], ...] = ()
+    compute: ComputeRows | None = None
 
     @cached_property
     def controller(self) -> Controller:
@@ -166,7 +167,7 @@ class Stress:
         measured = dv + np.stack([d.dv_deviation(plant) for d in draws], axis=1)
         known = [t.parameters(plant) for t in tests]
         mv0, x = np.stack([t.mv0 for t in tests]), np.stack([t.x0 for t in tests])
-        law, advance = VectorizedController(self.controller, n), advance_rows(plant, n)
+        law, advance = VectorizedController(self.controller, n, self.compute), advance_rows(plant, n)
         operate = None if self.operated is None else np.tile(self.operated, (n, 1))
         actuators = Actuators(plant.mv_signals, [d.fault for d in draws], mv0, [d.late for d in draws])
         state, readback, broke = law.cold_state(), mv0.copy(), np.zeros(n, dtype=bool)
@@ -223,6 +224,6 @@ def figures_of(outcomes: Sequence[StressOutcome], name: str) -> Array:
     return np.array([one.figures.get(name, np.nan) for one in outcomes])
 
 
-def opened(path: Path) -> tuple[Manifest, bytes]:
-    """The manifest of a controller file, and the bytes to send; ArtifactError where it is none."""
-    return Controller(path).manifest, path.read_bytes()
+def opened(path: Path) -> tuple[Controller, bytes]:
+    """The controller of a file, and the bytes to send; ArtifactError where it is none."""
+    return Controller(path), path.read_bytes()

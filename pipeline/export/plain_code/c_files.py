@@ -45,22 +45,31 @@ def c_folder(controller: Controller, name: str) -> dict[str, str]:
     ExportError where the graph has an operator without plain statements, or where the statements, run over the
     conformance kit, part from the controller.
     """
-    program = lowered(onnx.load(controller.path))
-    step, m = printed_step(program, name), controller.manifest
-    head = (
-        f"Law {m.law} of {m.case}, made of {controller.path.name} by loopwright {__version__}.\n"
-        f"   sha256 of that file: {controller.sha256}"
-    ).replace("*/", "* /")
+    program, head = lowered(onnx.load(controller.path)), _head(controller)
     call = ", ".join(IN_GUARD[n] for n in arguments_of(program))
     guards = {f"{name}_guard.{end}": _of_template(f"guard.{end}", name, head, call) for end in ("h", "c")}
     return {
-        f"{name}.h": printed_header(head, m, controller.sha256, name, step, arguments_of(program)),
-        f"{name}.c": _source(head, name, step),
+        **c_step(controller, program, name),
         **guards,
         f"{name}_selftest.c": printed_self_test(head, name, program, kit_in_c(controller, program)),
         "Makefile": _MAKEFILE.replace("LAW", name),
         "CMakeLists.txt": _CMAKE.replace("LAW", name),
     }
+
+
+def c_step(controller: Controller, program: PlainProgram, name: str) -> dict[str, str]:
+    """The text of ``NAME.h`` and ``NAME.c``: the step alone, of the ``program`` that its graph was lowered to."""
+    step, head = printed_step(program, name), _head(controller)
+    header = printed_header(head, controller.manifest, controller.sha256, name, step, arguments_of(program))
+    return {f"{name}.h": header, f"{name}.c": _source(head, name, step)}
+
+
+def _head(controller: Controller) -> str:
+    m = controller.manifest
+    return (
+        f"Law {m.law} of {m.case}, made of {controller.path.name} by loopwright {__version__}.\n"
+        f"   sha256 of that file: {controller.sha256}"
+    ).replace("*/", "* /")
 
 
 def arguments_of(program: PlainProgram) -> list[str]:

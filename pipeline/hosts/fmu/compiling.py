@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
-import shlex
-import shutil
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 from loopwright.pipeline.errors import HostError
+from loopwright.pipeline.export.plain_code.c_compiler import CCompiler
 from loopwright.pipeline.plants.fmu.description import fmpy
 
 HOSTS = Path(__file__).parents[1]
@@ -22,7 +19,6 @@ HEADER = "onnxruntime_c_api.h"
 # Any library that is no older serves it, and the host in C uses nothing newer, so it need not follow each release.
 SHIPPED = HOSTS / "c" / "onnxruntime"
 SHIPPED_SHA256 = "7783e9664bdb0b1b36145b5c8587dd1bc9a399aa000edf2e3dd03003cafc6882"
-COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c11", "-O2", "-fPIC", "-ffp-contract=off", "-fvisibility=hidden")
 LINKED = ("-shared", "-s", "-Wl,-z,defs", "-Wl,-rpath,$ORIGIN", "-lm")
 
@@ -31,7 +27,7 @@ LINKED = ("-shared", "-s", "-Wl,-z,defs", "-Wl,-rpath,$ORIGIN", "-lm")
 class Toolchain:
     """A C compiler and the folders of headers; ``library`` is that of onnxruntime, None: plain C computes the law."""
 
-    compiler: tuple[str, ...]
+    compiler: CCompiler
     includes: tuple[Path, ...]
     library: Path | None
 
@@ -44,12 +40,8 @@ class Toolchain:
         """Compile files of ``sources`` and link them; HostError with the compiler's first error."""
         headers = [f"-isystem{folder}" for folder in self.includes]
         parts = [*sources, *([] if self.library is None else [self.library])]
-        words = [*self.compiler, *FLAGS, *headers, *map(str, parts), "-o", str(to), *LINKED]
-        done = subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
-        if done.returncode:
-            lines = [line for line in done.stderr.splitlines() if line.strip()] or [f"status {done.returncode}"]
-            reason = next((line for line in lines if "error" in line), lines[0])
-            raise HostError(f"{self.compiler[0]} cannot compile the FMU: {reason.strip()}")
+        words = [*FLAGS, *headers, *map(str, parts), "-o", str(to), *LINKED]
+        self.compiler.compile(words, "the FMU")
 
 
 def toolchain(*, onnxruntime: bool = False) -> Toolchain:
@@ -61,22 +53,12 @@ def toolchain(*, onnxruntime: bool = False) -> Toolchain:
     if sys.platform != "linux":
         raise HostError(f"an FMU is built on Linux, whose libraries its options make; this is {sys.platform}")
     headers = Path(str(package.__file__)).parent / "c-code"
-    compiler = _compiler()
+    compiler = CCompiler.here()
     if not onnxruntime:
         return Toolchain(compiler, (headers,), None)
     library = _library()
     _require_no_older(library, SHIPPED / HEADER)
     return Toolchain(compiler, (SHIPPED, headers), library)
-
-
-def _compiler() -> tuple[str, ...]:
-    named = shlex.split(os.environ.get("CC", ""))
-    for words in [named] if named else [[name] for name in COMPILERS]:
-        found = shutil.which(words[0])
-        if found:
-            return found, *words[1:]
-    wanted = f"CC names {named[0]!r}, which is not there" if named else f"none of {', '.join(COMPILERS)} is there"
-    raise HostError(f"an FMU is compiled, and no C compiler is installed: {wanted}; apt-get install gcc brings one")
 
 
 def _library() -> Path:
