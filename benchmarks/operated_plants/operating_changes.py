@@ -25,7 +25,10 @@ CONVERGED = {"passes": 12, "changes": 40}  # of the law's own problem: what the 
 
 @dataclass(frozen=True, slots=True)
 class AtOdds:
-    """Two ends of ranges that no MVs keep together, with what makes it so; ``first`` and ``second`` are PVs."""
+    """Two ends of ranges that no MVs keep together, with what makes it so; ``first`` and ``second`` are PVs.
+
+    The furnace's oxygen ranks before both: with an outlet that ranks first a plan which keeps it burns all oxygen.
+    """
 
     first: str
     second: str
@@ -34,7 +37,7 @@ class AtOdds:
 
 AT_ODDS = {
     "column": AtOdds("AB", "PD", {"AT.track": 0.0, "AB.high": 1.2, "PD.high": 30.0, "reflux.low": 45.0}),
-    "furnace": AtOdds("TO", "TS", {"TO.track": 0.0, "TO.low": 380.0, "TS.high": 490.0}),
+    "furnace": AtOdds("TO", "TS", {"TO.track": 0.0, "TO.low": 380.0, "TS.high": 490.0, "O2.rank": 1.0}),
     "exchanger": AtOdds("TM", "TS", {"TM.track": 0.0, "TM.low": 80.0, "TS.high": 105.0}),
 }
 
@@ -63,7 +66,7 @@ def shares(plant: OperatedPlant, controller: Controller, odds: AtOdds) -> tuple[
     """Share [%] of the violation with the lower rank, with ``first`` ranked higher and with ``second``."""
     found = []
     for high, low in ((odds.first, odds.second), (odds.second, odds.first)):
-        values = {**odds.values, f"{high}.rank": 1.0, f"{low}.rank": 4.0}
+        values = {**odds.values, f"{high}.rank": 2.0, f"{low}.rank": 4.0}
         served = Served(controller)
         served.operate = Operate(controller.manifest.operate).with_values(values)
         run = run_day(plant, served, quiet_day(plant, QUIET))
