@@ -20,7 +20,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 SAME_READ_BACK = 1e-3  # of an MV's range: a read-back no farther than that from where it was expected has not moved
 OFFSET_ROUNDING = 1e-9  # of an MV's range: less is no offset, and the read-back itself is where the MV stands
-EQUAL_COMMANDS = 5  # equal commands in a row: a read-back that lags has followed
+EQUAL_COMMANDS = 5  # equal commands in a row, but for rounding: a read-back that lags has followed
 
 
 class StandingMv:
@@ -52,7 +52,8 @@ class StandingMv:
         if self.lost:
             return
         if written:
-            self._rested = self._rested + 1 if mv.tolist() == self.mv.tolist() else 0
+            rests = bool((np.abs(mv - self.mv) <= self._least).all())  # a law at rest moves by rounding
+            self._rested = self._rested + 1 if rests else 0
             self._offset = self._seen
         else:
             self._rested, self._seen = 0, self._offset

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import lsq_linear
 
-from loopwright.pipeline.laws.predictive.bounded_minimum import RIDGE, BoundedMinimum
+from loopwright.pipeline.laws.predictive.bounded_minimum import PLAN_RIDGE, BoundedMinimum
 
 Problem = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 seeds = st.integers(0, 2**16)
@@ -32,7 +32,7 @@ def problem(seed: int, m: int, flat: float = 0.1) -> Problem:
 
 def minimum(h: np.ndarray, pull: np.ndarray, plan: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """By an active set of scipy, with the price of a step away from the plan."""
-    ridge = RIDGE * np.diag(h)
+    ridge = PLAN_RIDGE * np.diag(h)
     h, pull = h + np.diag(ridge), pull + ridge * np.clip(plan, low, high)
     root = np.linalg.cholesky(h)
     found = lsq_linear(root.T, np.linalg.solve(root, pull), (low, high), method="bvls", tol=1e-14, max_iter=1000)
@@ -50,7 +50,7 @@ def cost(given: Problem, z: np.ndarray) -> float:
     """With the price of the step."""
     h, pull, plan, low, high = given
     off = z - np.clip(plan, low, high)
-    return float(z @ h @ z / 2 - pull @ z + RIDGE * (np.diag(h) * off**2).sum() / 2)
+    return float(z @ h @ z / 2 - pull @ z + PLAN_RIDGE * (np.diag(h) * off**2).sum() / 2)
 
 
 @given(seeds, st.integers(1, 15), st.sampled_from([1.0, 0.1, 0.01]))

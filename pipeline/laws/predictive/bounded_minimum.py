@@ -9,14 +9,14 @@ from loopwright.pipeline.laws.base import hold_numbers
 from loopwright.pipeline.laws.predictive.horizon import product
 
 NEVER = 1e200  # over a pivot: an entry at a bound is not solved for
-# Of a step away from the present plan. With .001 a law with default ranges moves as one without `operate` whose sweeps
-# come to their end, within .01 of half a range (40 random models); with .05 within .2. The evaporator of the benchmark
-# of plants under ranges and costs earns 713 an hour with .001, 708 with .01, 694 with .05; with 1e-6 a file and its law
-# part by 1e-8 where MVs do nearly the same.
-RIDGE = 0.001
+# The price of a step away from the present plan, of the curvature. With .001 a law with default ranges moves as one
+# without `operate` whose sweeps come to their end, within .04 of half a range (24 random models); with .05 within .2.
+# The evaporator of the benchmark of plants under ranges and costs earns 713 an hour with .001, 708 with .01 and 694
+# with .05. With 1e-6 a file and its law part by 1e-8 where MVs do nearly the same.
+PLAN_RIDGE = 0.001
 AT_BOUND = 1e-9  # of half an entry's range: nearer to its end it lies there
-LEAST_GAIN = 1e-12  # scaled: a force beyond a bound, or off it, that is smaller is rounding
-APART = 1e-6  # of that force, an entry: of two that are the same, one is exchanged
+LEAST_FORCE = 1e-12  # scaled: a force beyond a bound, or off it, that is smaller is rounding
+TIE_BREAK = 1e-6  # of that force, an entry: of two that are the same, one is exchanged
 
 
 class BoundedMinimum(nn.Module):
@@ -51,7 +51,7 @@ class BoundedMinimum(nn.Module):
     zero: Tensor  # (1,)
     near: Tensor  # (1,) to a bound
 
-    def __init__(self, m: int, changes: int, ridge: float = RIDGE) -> None:
+    def __init__(self, m: int, changes: int, ridge: float = PLAN_RIDGE) -> None:
         super().__init__()
         self.m, self.changes = m, changes
         eye = torch.eye(m, dtype=torch.float64)
@@ -59,7 +59,7 @@ class BoundedMinimum(nn.Module):
         self.register_buffer("whole", (1.0 - ridge) * eye)
         self.register_buffer("others", (1.0 - eye) / (1.0 + ridge))
         self.register_buffer("columns", eye.unsqueeze(-2).repeat(1, m, 1))
-        self.register_buffer("apart", 1.0 + APART * torch.arange(m, dtype=torch.float64).unsqueeze(0))
+        self.register_buffer("apart", 1.0 + TIE_BREAK * torch.arange(m, dtype=torch.float64).unsqueeze(0))
         hold_numbers(self, ridge=ridge, share=1.0 / (1.0 + ridge), never=NEVER, one=1.0, zero=0.0, near=AT_BOUND)
 
     def forward(
@@ -87,7 +87,7 @@ class BoundedMinimum(nn.Module):
             best, x = self._best(table, b, x, side, room)
             pivot = side - own
             gain = torch.sign(x) * (x - best) / pivot * self.apart
-            most = torch.clamp(gain.amax(dim=-1, keepdim=True), min=LEAST_GAIN)
+            most = torch.clamp(gain.amax(dim=-1, keepdim=True), min=LEAST_FORCE)
             change = torch.where(gain >= most, self.one, self.zero)
             row = change @ table
             over = row * (change / pivot).sum(dim=-1, keepdim=True)
