@@ -46,7 +46,7 @@ def read_all(row: Mapping[str, Any], where: str) -> dict[str, Array]:
 
 
 # ------------------------------------------------------------------------------------------------------------- the kit
-KIT = 4  # version of the format: up to 3 no step said from which state it starts, so that only chains were compared
+KIT = 5  # version of the format: 4 had no scan in SHADOW, and up to 3 no step said from which state it starts
 VECTORS = "vectors.json"
 KIT_TOLERANCE = 1e-9  # share of an entry's scale, in one step from the kit's state: WebAssembly differs by up to 3e-10
 CHAIN_TOLERANCE = 1e-6  # share of an entry's scale, chained: a thousandfold before the chain begins again
@@ -68,6 +68,10 @@ PASS = (
     "unwritten = true: the command of the scan before did not reach the plant; your loop learns it before this scan. "
     "Somebody may have moved the MV: the next sound read-back is where it stands, also by hand and in a sample that is "
     "refused for another reason. Without any read-back the MV before that command stays.",
+    "set_mode = SHADOW: others command. Nothing is written (mv = null), and the law is stepped on what is read back. "
+    "Once another mode is set, others may have moved the MV since the last sample: the next sound read-back is where "
+    "it stands, also in a sample that is refused for another reason, and nothing is written before it. A good sample "
+    "without a read-back says that there is none: the MV of the last one stays.",
     "The loop is not told where the MV stands (loop: mv = null). Until a good sample has a read-back, nothing may be "
     "written (mv = null); that read-back is where the loop begins. Only then a fault holds the last MV.",
     "Every number is a hexadecimal float as C's printf writes it with %a and strtod reads it, or nan, inf, -inf.",
