@@ -14,10 +14,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.serving.conformance.batch_of_one import SUFFIX, batch_of_one
 from loopwright.serving.conformance.scans import Scanned, scanned, start
 from loopwright.serving.conformance.steps import OUTPUTS, StepResult, answered, beginnings
 from loopwright.serving.controller import Controller, runtime_version
-from loopwright.serving.controller_file import sidecar
+from loopwright.serving.controller_file import file_digest, sidecar
 from loopwright.serving.errors import ContractError, LoopwrightError
 from loopwright.serving.guard import READ_BACK_MARGIN, InRange, Sample
 from loopwright.serving.words import plain
@@ -94,14 +95,20 @@ PASS_OF_AHEAD = (
 def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
     """Write the kit into ``folder``, which is made if it is not there, and return what ``vectors.json`` holds.
 
+    Beside the controller's file lies the same step for runtimes that want a leading batch of 1, see ``batch_of_one``.
+
     Raises LoopwrightError if the folder cannot be written.
     """
+    batched = batch_of_one(controller.path.read_bytes())
+    batched_name = controller.path.with_suffix("").name + SUFFIX
     vectors = vectors_of(controller)
+    vectors["batch_of_one"] = {"file": batched_name, "sha256": file_digest(batched)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         copy = folder / controller.path.name
         if not (copy.exists() and copy.samefile(controller.path)):
             shutil.copyfile(controller.path, copy)
+        (folder / batched_name).write_bytes(batched)
         copy.with_suffix(".json").write_text(sidecar(controller.manifest, controller.sha256), encoding="utf-8")
         rows = json.dumps(vectors, allow_nan=False).replace('{"part"', '\n{"part"').replace('{"what"', '\n{"what"')
         (folder / VECTORS).write_text(rows + "\n", encoding="utf-8")
