@@ -3,8 +3,9 @@
 ``python benchmarks/matiec.py MATIEC [FILE ...] [--compiler "gcc -O1"]``: MATIEC is the folder of a built
 https://github.com/beremiz/matiec (autoreconf -i; ./configure; make). Of each file (all shipped ones) the types, step,
 guard and test program become C, and the test program runs until it is done. Two of that compiler's faults are gone
-round: it takes a number above 3.4E38 for none of LREAL, so that those become 1E37 (the test's infinite numbers are then
-large ones), and its C leaves out a loop of one round, which is mended in the C. Half a minute a predictive file.
+round: it takes a single number above 3.4E38 or below 1.2E-38 for none of LREAL, so that those become 1E37 and 1E-37
+(the test's infinite numbers are then large ones), and its C leaves out a loop of one round, which is mended in the C.
+Half a minute a predictive file.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from loopwright.serving import Controller
 
 ROOT = Path(__file__).parents[1]
 MOST_CYCLES = 2_000  # of a test program; it ends after 250 to 400
-LARGE = re.compile(r"\b\d\.\d+E\+308\b")
+EXTREME = re.compile(r"\b\d\.\d+E([+-])308\b")
 LOOP = re.compile(r"(int __do_increment = 0;\s*while\( )(.+?) (<|>) (.+?) \) \{")
 CONFIGURATION = """CONFIGURATION config
 RESOURCE res ON PLC
@@ -62,7 +63,7 @@ def row(file: Path, matiec: Path, compiler: str) -> str:
     began = time.monotonic()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        (folder / "all.st").write_text(LARGE.sub("1.0E+37", text), encoding="utf-8")
+        (folder / "all.st").write_text(EXTREME.sub(r"1.0E\g<1>37", text), encoding="utf-8")
         command = [str(matiec / "iec2c"), "-I", str(matiec / "lib"), "-T", made, str(folder / "all.st")]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         pous = folder / "POUS.c"
