@@ -143,7 +143,7 @@ class ControlLoop:
         self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
         self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         self._transfer.begin()
-        self._took_over = False  # whether a shadow has just ended: others may have moved the MV
+        self._stood: Array | None = None  # shape: (n_mv,), the same, and where others had moved it until now
 
     # ------------------------------------------------------------------ who is in charge
     @property
@@ -226,7 +226,7 @@ class ControlLoop:
         if mode is not self.mode:
             self._transfer.begin()
             self._out.begun(mode, self._active.in_hand)
-            self._took_over = self.mode is Mode.SHADOW
+            self._applied.take(mode is not Mode.SHADOW and (self._applied.taken or self.mode is Mode.SHADOW))
         self._mode.set(mode)
 
     def set_sp(self, sp: ArrayLike) -> tuple[str, ...]:
@@ -294,7 +294,8 @@ class ControlLoop:
         if taken.any():
             self.set_operate({f"{s.name}.use": 0.0 for s, of in zip(signals, taken.tolist(), strict=True) if of})
         self._mv = self._out.hand.sent(self._mv, wanted, signals, taken)
-        self._took_over = self._took_over and self._out.hand.wanted is not None  # else the MV is where it was sent
+        on_its_way = self._out.hand.wanted is not None
+        self._applied.take(self._applied.taken and on_its_way)  # else the MV is where it was sent
 
     def require_in_hand(self, names: Collection[str], take: Collection[str] = ()) -> None:
         """LoopError unless operators have these MVs in hand: all in MANUAL, those of ``use`` 0 in AUTO and HOLD.
@@ -315,11 +316,12 @@ class ControlLoop:
         readings = self._active.look(sample, self._out.local.why)
         reason, self._refused_why = readings.reason, ""
         self._applied.arrived()
+        taken = self._applied.taken
         shown = self._applied.look(sample, self._mv, refused=bool(reason), theirs=self._out.local.away)
-        self.found = shown.found
+        self.found = self._stood = shown.found
         blind = self._out.hand.wanted is not None and isnan(self._mv[0])  # on a way by hand from nobody knows where
-        if shown.applied is not None and (self._took_over or blind):
-            self._mv = shown.applied.copy()
+        if shown.applied is not None and (taken or blind):
+            self._mv = self._stood = shown.applied.copy()
         if shown.silent:
             if shown.outside:
                 self._mv = np.full(len(self._mv), nan)
@@ -371,9 +373,12 @@ class ControlLoop:
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
         self._applied.arrived()
-        self.found = None
+        self.found = self._stood = None
         self._sp = self.courses.followed(self._sp, self.controller.manifest.sp)
         self._active.missed(1)
+        silent = self._applied.untold()
+        if silent:
+            return self._without_sample(f"{reason}; {silent}", silent=True)
         self._mv = self._out.follow(self._mv, None, self._applied, self.mode, self._active.in_hand)
         return self._without_sample(reason)
 
@@ -391,7 +396,7 @@ class ControlLoop:
 
         Where the scan has found that the MV stands elsewhere, it stays there.
         """
-        stands = np.array(before if self.found is None else self.found, dtype=np.float64)
+        stands = np.array(before if self._stood is None else self._stood, dtype=np.float64)
         by_hand = self.mode is Mode.MANUAL and self._out.hand.wanted is None  # where it should be is where it goes
         self._mv = self._out.hand.sent(stands, self._mv, self.controller.manifest.mv) if by_hand else stands
         self._applied.lose()
@@ -427,7 +432,6 @@ class ControlLoop:
         self._scan += 1
         self.courses.over()
         self.courses.passed(1)
-        self._took_over = False
         back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
         command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back, local=self.local)
         self._applied.command(self._mv, written=command.writes)

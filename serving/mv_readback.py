@@ -80,6 +80,7 @@ class StandingMv:
 # ------------------------------------------------------------------------------------------------------ the applied MV
 
 UNREAD = "the last MV did not reach the plant: nothing is written before a good read-back tells where the MV stands"
+UNTOLD = "others had the MV until now: nothing is written before a good read-back tells where the MV stands"
 
 
 class ShownMV(NamedTuple):
@@ -97,7 +98,8 @@ class AppliedMV:
     Such a command leaves it unknown where the MV stands: others may move it meanwhile. The next read-back tells, also
     that of a sample which is refused for another reason, and nothing writes an old MV over it. Nothing is written while
     the read-back is bad, nor, where the MV stands outside its range, until it is back. A plant that reads nothing back
-    gets the old MV.
+    gets the old MV. The same holds where a shadow has just ended (``take``): others may have moved the MV since its
+    last sample.
     """
 
     def __init__(self, signals: Sequence[Signal], mv: Array) -> None:
@@ -106,11 +108,27 @@ class AppliedMV:
         self._standing = StandingMv(signals, mv)
         self._given, self._written = mv, False  # shape: (n_mv,), the last command, and whether it went to the plant
         self._is_read = False  # whether the plant has ever read it back
+        self._taken = False  # whether others had the MV until now, and no sample has told since where it stands
 
     @property
     def lost(self) -> bool:
         """Whether the last command did not arrive, and no read-back has come since."""
         return self._standing.lost
+
+    @property
+    def taken(self) -> bool:
+        """Whether others had the MV until now, and no sample has told since where it stands."""
+        return self._taken
+
+    def take(self, taken: bool = True) -> None:
+        """Others had the MV until now; or ``taken`` is false: somebody says where it goes."""
+        self._taken = taken
+
+    def untold(self, *, is_read: bool = False) -> str:
+        """Why nothing may be written where no sample tells; empty: it may. ``is_read``: the plant reads back now."""
+        if not (self._is_read or is_read):
+            return ""
+        return UNREAD if self.lost else UNTOLD if self._taken else ""
 
     def lose(self) -> None:
         """The last command did not arrive."""
@@ -140,11 +158,11 @@ class AppliedMV:
         except Exception:  # no sample, or no MV that any actuator can have
             return self._unread(sample)
         if applied is not None:
-            self._is_read = True
+            self._is_read, self._taken = True, False
             return ShownMV(applied, self._standing.seen(applied))
         if refused:
             return self._unread(sample)
-        self._standing.lost = False
+        self._standing.lost = self._taken = False
         return ShownMV()
 
     def read_back(self, sample: Sample, last: Array) -> Array:
@@ -178,14 +196,13 @@ class AppliedMV:
         return self._standing.at(applied)
 
     def _unread(self, sample: Sample) -> ShownMV:
-        """No sound read-back: after a loss nothing is written, unless the plant never reads anything back."""
-        if not self.lost:
+        """No sound read-back: nothing is written after a loss or a take-over, unless the plant never reads back."""
+        if not (self.lost or self._taken):
             return ShownMV()
         outside = self._outside(sample)
         if outside:
             return ShownMV(silent=reworded(outside, f"{outside}: nothing is written before it is back"), outside=True)
-        is_read = self._is_read or getattr(sample, "mv_applied", None) is not None
-        return ShownMV(silent=UNREAD if is_read else "")
+        return ShownMV(silent=self.untold(is_read=getattr(sample, "mv_applied", None) is not None))
 
     def _outside(self, sample: Sample) -> str:
         """Why no loop can have commanded the MV that the plant has; empty where the sample does not tell."""

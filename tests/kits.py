@@ -194,7 +194,7 @@ def refuses_an_old_kit(run: Run, folder: Path) -> None:
     """One line says what to do."""
     done = run("--conformance", spoilt(PID, folder, an_old_version))
     assert (done.returncode, done.stdout) == (2, ""), done.stdout + done.stderr
-    wanted = "the kit has the version 3, not 4: write it again with loopwright conformance FILE.onnx KIT"
+    wanted = "the kit has the version 3, not 5: write it again with loopwright conformance FILE.onnx KIT"
     assert done.stderr == f"error: {wanted}\n"
 
 

@@ -14,10 +14,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.serving.conformance.batch_of_one import SUFFIX, batch_of_one
 from loopwright.serving.conformance.scans import Scanned, scanned, start
 from loopwright.serving.conformance.steps import OUTPUTS, StepResult, answered, beginnings
 from loopwright.serving.controller import Controller, runtime_version
-from loopwright.serving.controller_file import sidecar
+from loopwright.serving.controller_file import file_digest, sidecar
 from loopwright.serving.errors import ContractError, LoopwrightError
 from loopwright.serving.guard import READ_BACK_MARGIN, InRange, Sample
 from loopwright.serving.words import plain
@@ -46,7 +47,7 @@ def read_all(row: Mapping[str, Any], where: str) -> dict[str, Array]:
 
 
 # ------------------------------------------------------------------------------------------------------------- the kit
-KIT = 4  # version of the format: up to 3 no step said from which state it starts, so that only chains were compared
+KIT = 5  # version of the format: 4 had no scan in SHADOW, and up to 3 no step said from which state it starts
 VECTORS = "vectors.json"
 KIT_TOLERANCE = 1e-9  # share of an entry's scale, in one step from the kit's state: WebAssembly differs by up to 3e-10
 CHAIN_TOLERANCE = 1e-6  # share of an entry's scale, chained: a thousandfold before the chain begins again
@@ -68,6 +69,10 @@ PASS = (
     "unwritten = true: the command of the scan before did not reach the plant; your loop learns it before this scan. "
     "Somebody may have moved the MV: the next sound read-back is where it stands, also by hand and in a sample that is "
     "refused for another reason. Without any read-back the MV before that command stays.",
+    "set_mode = SHADOW: others command. Nothing is written (mv = null), and the law is stepped on what is read back. "
+    "Once another mode is set, others may have moved the MV since the last sample: the next sound read-back is where "
+    "it stands, also in a sample that is refused for another reason, and nothing is written before it. A good sample "
+    "without a read-back says that there is none: the MV of the last one stays.",
     "The loop is not told where the MV stands (loop: mv = null). Until a good sample has a read-back, nothing may be "
     "written (mv = null); that read-back is where the loop begins. Only then a fault holds the last MV.",
     "Every number is a hexadecimal float as C's printf writes it with %a and strtod reads it, or nan, inf, -inf.",
@@ -90,14 +95,20 @@ PASS_OF_AHEAD = (
 def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
     """Write the kit into ``folder``, which is made if it is not there, and return what ``vectors.json`` holds.
 
+    Beside the controller's file lies the same step for runtimes that want a leading batch of 1, see ``batch_of_one``.
+
     Raises LoopwrightError if the folder cannot be written.
     """
+    batched = batch_of_one(controller.path.read_bytes())
+    batched_name = controller.path.with_suffix("").name + SUFFIX
     vectors = vectors_of(controller)
+    vectors["batch_of_one"] = {"file": batched_name, "sha256": file_digest(batched)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         copy = folder / controller.path.name
         if not (copy.exists() and copy.samefile(controller.path)):
             shutil.copyfile(controller.path, copy)
+        (folder / batched_name).write_bytes(batched)
         copy.with_suffix(".json").write_text(sidecar(controller.manifest, controller.sha256), encoding="utf-8")
         rows = json.dumps(vectors, allow_nan=False).replace('{"part"', '\n{"part"').replace('{"what"', '\n{"what"')
         (folder / VECTORS).write_text(rows + "\n", encoding="utf-8")

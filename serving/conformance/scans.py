@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field, replace
 from math import inf, nan
 from typing import Any, TypeAlias
@@ -107,7 +107,7 @@ def scanned(controller: Controller) -> list[Scanned]:
         before = loop.mv
         command = loop.miss("the plant cannot be read") if scan.sample is None else loop.scan(scan.sample)
         done.append(Scanned(scan, command))
-        stands = command.mv if command.writes else stands
+        stands = command.mv if command.writes or command.mode is Mode.SHADOW else stands  # a shadow's MV is others'
         try:
             scan = scans.send(course.sample(stands))
         except StopIteration:
@@ -166,14 +166,18 @@ def _scans(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
     good = yield KitScan("back to AUTO", good, set_mode=Mode.AUTO)
     yield from some(2, "the last samples")
     if "fresh" in m.inputs:
-        yield from _gone(m, good)
+        good = yield from _gone(m, good)
+    yield from _others(m, good)
 
 
 STAYS_BAD = 3  # scans for which readings stay bad after they were bridged
 
 
-def _gone(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
-    """Readings that are bad for longer than they are bridged: of each PV alone, over a gap, and of all together."""
+def _gone(m: Manifest, good: Sample) -> Generator[KitScan, Sample, Sample]:
+    """Readings that are bad for longer than they are bridged: of each PV alone, over a gap, and of all together.
+
+    The next good sample is returned.
+    """
     bridged = round(BRIDGE_PERIODS)
     for i, s in enumerate(m.pv):
         for k in range(bridged + STAYS_BAD):
@@ -188,6 +192,60 @@ def _gone(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
         good = yield KitScan(f"all PVs are bad for {k + 1} scans", none)
     for _ in range(KIT_RECOVERY + 2):
         good = yield KitScan("after all PVs were bad", good)
+    return good
+
+
+def _others(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
+    """Others command: in SHADOW, also over the period in which it ends, and after commands that did not arrive."""
+
+    def pv_bad(sample: Sample) -> Sample:
+        return _with(sample, "pv", 0, nan)
+
+    def unread(sample: Sample) -> None:
+        return None
+
+    def no_read_back(sample: Sample) -> Sample:
+        return replace(sample, mv_applied=None)
+
+    def blind(sample: Sample) -> Sample:
+        return no_read_back(pv_bad(sample))
+
+    def outside(sample: Sample) -> Sample:
+        return replace(sample, mv_applied=np.array([2 * s.high - s.low for s in m.mv], dtype=np.float64))
+
+    # What the first scans show once a shadow has ended; others have moved the MV before the last of them.
+    ends: tuple[tuple[str, tuple[Callable[[Sample], Sample | None], ...]], ...] = (
+        ("", ()),
+        ("a PV is not finite", (pv_bad,)),
+        ("the plant cannot be read", (unread, unread)),
+        ("a PV is not finite and there is no read-back", (blind,)),
+        ("there is no read-back", (no_read_back,)),
+        *(() if _apart(m) else (("the applied MV is far outside", (outside, outside)),)),
+    )
+    good = yield KitScan("others have the plant", good, set_mode=Mode.SHADOW)
+    good = yield KitScan("others have the plant, and a PV is not finite", pv_bad(_moved(m, good)))
+    for mode, shown in ((Mode.MANUAL, ends[:3]), (Mode.HOLD, ends), (Mode.AUTO, ends)):
+        for words, spoilt in shown:
+            good = yield KitScan("others have the plant", good, set_mode=Mode.SHADOW)
+            good = yield KitScan("others move the MV", _moved(m, good))
+            what = f"from SHADOW to {mode}" + (f", and {words}" if words else "")
+            set_mode: Mode | None = mode
+            for spoil in spoilt:
+                moved = _moved(m, good) if spoil is pv_bad else good
+                good, set_mode = (yield KitScan(what, spoil(moved), set_mode=set_mode)), None
+            good = yield KitScan(f"{what}: others have moved the MV", _moved(m, good), set_mode=set_mode)
+            for _ in range(KIT_RECOVERY if mode is Mode.AUTO else 1):
+                good = yield KitScan(f"after {what}", good)
+    good = yield KitScan("a command did not arrive, and the plant cannot be read", None, unwritten=True)
+    good = yield KitScan("the plant cannot be read after a command that did not arrive", None)
+    good = yield KitScan("the MV was moved meanwhile", _moved(m, good))
+    for _ in range(KIT_RECOVERY + 1):
+        good = yield KitScan("after the MV was moved", good)
+    good = yield KitScan("others have the plant", good, set_mode=Mode.SHADOW)
+    good = yield KitScan("from SHADOW to HOLD, and others have moved the MV", _moved(m, good), set_mode=Mode.HOLD)
+    good = yield KitScan("its command did not arrive, and there is no read-back", no_read_back(good), unwritten=True)
+    for _ in range(2):
+        good = yield KitScan("after a command that did not arrive", good)
 
 
 def _apart(m: Manifest) -> set[str]:

@@ -164,3 +164,36 @@ def _integer(field: _Field, number: int) -> int:
     if number >= (_ENUM_END if field.kind == "enum" else 2**31):
         raise ValueError(f"field {field.name!r} is {number}, which is out of its range")
     return number
+
+
+def write_model(model: Message) -> bytes:
+    """The canonical bytes of a ModelProto as ``read_model`` gives it: read again they are the same message."""
+    return _written("ModelProto", model)
+
+
+def _written(kind: str, message: Message) -> bytes:
+    parts = []
+    for name, (number, of) in sorted(SCHEMA[kind].items(), key=lambda item: item[1][0]):
+        if name in message:
+            of, tag = of.rstrip("*"), _varint(number << 3 | _WIRE.get(of.rstrip("*"), 2))
+            rows = message[name] if isinstance(message[name], list) else [message[name]]
+            parts += [tag + _value(of, row) for row in rows]
+    return b"".join(parts)
+
+
+def _value(kind: str, value: Any) -> bytes:
+    if kind == "float":
+        return struct.pack("<f", value)
+    if kind in _WIRE:
+        return _varint(value % 2**64)
+    content = _written(kind, value) if kind in _FIELDS else value.encode() if kind == "string" else value
+    return _varint(len(content)) + content
+
+
+def _varint(value: int) -> bytes:
+    """An unsigned number of 7 bits a byte."""
+    found = bytearray()
+    while value > 0x7F:
+        found.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*found, value])

@@ -174,7 +174,7 @@ def test_a_kit_holds_readings_that_stay_bad(steered: tuple[Controller, Path]) ->
     for k in range(1, 14):
         assert known[f"PV y0 is bad for {k} scans"] == ("AUTO", False)
         assert known[f"all PVs are bad for {k} scans"] == (("AUTO", False) if k <= 10 else ("HOLD", True))
-    assert scans[-1]["mode"] == "AUTO"
+    assert known["after all PVs were bad"] == ("AUTO", False)
     moves = [row["mv"] for row in scans if row["what"].startswith("PV y0 is bad")]
     assert len(set(map(tuple, moves))) > 5  # the law goes on
 
@@ -248,25 +248,51 @@ def test_the_scans_begin_without_information(pi_file: Path, vectors: Json) -> No
     assert float.fromhex(rows[known]["mv"][0]) != valve.middle
     assert rows[known + 1]["sample"] is None  # a fault after that holds it
     assert rows[known + 1]["mv"] == rows[known]["mv"]
-    assert all(row["mv"] is not None for row in rows[known:])
+    others = next(k for k, row in enumerate(rows) if row["set_mode"] == "SHADOW")
+    assert all(row["mv"] is not None for row in rows[known:others])
 
 
 def test_the_scans_hold_commands_that_did_not_arrive(vectors: Json) -> None:
     """The loop goes on from where the MV stands, in each mode, and not from where the lost command left it."""
     rows = vectors["scans"]
     lost = [k for k, row in enumerate(rows) if row["unwritten"]]
-    found = {k: rows[k] for k in lost if rows[k]["sample"]["mv_applied"] is not None}
-    assert [rows[k]["mode"] for k in lost] == ["HOLD", "HOLD", "HOLD", "MANUAL"]
-    assert [rows[k - 1]["mode"] for k in lost] == ["AUTO", "AUTO", "AUTO", "MANUAL"]
+    found = {k: rows[k] for k in lost if rows[k]["sample"] and rows[k]["sample"]["mv_applied"] is not None}
+    assert [rows[k]["mode"] for k in lost] == ["HOLD", "HOLD", "HOLD", "MANUAL", "HOLD", "HOLD"]
+    assert [rows[k - 1]["mode"] for k in lost] == ["AUTO", "AUTO", "AUTO", "MANUAL", "AUTO", "HOLD"]
     for k, row in found.items():
         moved = float.fromhex(row["mv"][0]) - float.fromhex(rows[k - 1]["mv"][0])
         assert row["mv"] == row["sample"]["mv_applied"]
         assert abs(moved) >= 0.25 * float.fromhex(vectors["scale"]["mv"][0])
-    (unread,) = set(lost) - set(found)
+    silent, unread, after_others = sorted({*lost} - {*found}, key=lambda k: (rows[k]["sample"] is not None, k))
     assert rows[unread]["mv"] == rows[unread - 2]["mv"]  # what the plant had before the command that was lost
+    assert rows[silent]["mv"] is rows[silent + 1]["mv"] is None
+    assert rows[silent + 2]["mv"] == rows[silent + 2]["sample"]["mv_applied"]
+    assert rows[after_others]["mv"] == rows[after_others - 1]["sample"]["mv_applied"]  # where others had moved it
 
 
-@pytest.mark.parametrize("version", [1, 2, 3])
+def test_the_scans_hold_what_others_command(vectors: Json) -> None:
+    """Nothing is written in SHADOW, nor after it before a sample tells; then never the MV of a scan before."""
+    rows = vectors["scans"]
+    shadow = [k for k, row in enumerate(rows) if row["mode"] == "SHADOW"]
+    assert all(rows[k]["mv"] is None for k in shadow)
+    ends = [k + 1 for k in shadow if rows[k + 1]["mode"] != "SHADOW"]
+    assert {rows[k]["set_mode"] for k in ends} == {"MANUAL", "HOLD", "AUTO"}
+    silent = 0
+    for k in ends:
+        then, sample = rows[k], rows[k]["sample"]
+        left = rows[k - 1]["sample"]["mv_applied"]
+        back = sample and sample["mv_applied"]
+        sound = back is not None and -2.0 <= float.fromhex(back[0]) <= 102.0
+        if not sound and (then["fault"] or not sample):
+            assert then["mv"] is None
+            silent += 1
+        elif then["mode"] != "AUTO":
+            assert then["mv"] == (back or left)
+            assert (then["mv"] != left) == sound
+    assert silent == 1 + 2 * 3
+
+
+@pytest.mark.parametrize("version", [1, 2, 3, 4])
 def test_an_old_kit_is_one_line_that_says_what_to_do(
     pi_file: Path, vectors: Json, answers: Json, tmp_path: Path, capsys: Capture, version: int
 ) -> None:
@@ -277,7 +303,7 @@ def test_an_old_kit_is_one_line_that_says_what_to_do(
     path.write_text(json.dumps(answers))
     assert main(["conformance", str(pi_file), str(tmp_path), "--check", str(path)]) == 2
     said = capsys.readouterr().err
-    assert f"{VECTORS} has the version {version}; this release reads 4: write it again with" in said
+    assert f"{VECTORS} has the version {version}; this release reads 5: write it again with" in said
     assert said.count("\n") == 1
 
 
@@ -499,7 +525,8 @@ def test_the_command_writes_and_checks(
     assert main(["conformance", str(pi_file), str(out)]) == 0
     said = capsys.readouterr().out
     assert all(words in said for words in PASS)
-    assert {file.name for file in out.iterdir()} == {pi_file.name, pi_file.with_suffix(".json").name, VECTORS}
+    beside = {pi_file.with_suffix(".json").name, "pi.batch1.onnx", VECTORS}
+    assert {file.name for file in out.iterdir()} == {pi_file.name, *beside}
     assert (out / pi_file.name).read_bytes() == pi_file.read_bytes()
     assert (out / VECTORS).read_text() == (kit / VECTORS).read_text()  # the same every time
     manifest = json.loads((out / pi_file.with_suffix(".json").name).read_text())

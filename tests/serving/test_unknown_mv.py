@@ -126,6 +126,52 @@ def test_a_shadow_that_takes_over_writes_the_mv_that_is_read_back_now(mode: Mode
     assert loop.scan(sample(mv=STANDS + 9)).mv.tolist() == [STANDS + 8]  # from then on it is the loop's
 
 
+def test_a_shadow_that_ends_by_way_of_another_mode_writes_no_old_mv(pi_file: Path) -> None:
+    loop = loop_on(pi_file, mode=Mode.SHADOW)
+    loop.scan(sample())
+    loop.set_mode(Mode.AUTO)
+    loop.set_mode(Mode.MANUAL)
+    assert loop.scan(sample(mv=STANDS + 8)).mv.tolist() == [STANDS + 8]
+
+
+@pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD, Mode.AUTO])
+def test_as_a_shadow_ends_nothing_is_written_before_a_sample_tells_where_the_mv_stands(
+    mode: Mode, pi_file: Path
+) -> None:
+    loop = loop_on(pi_file, mode=Mode.SHADOW)
+    loop.scan(sample())
+    loop.set_mode(mode)
+    assert not loop.miss("no route").writes
+    assert not loop.scan(sample(math.nan, mv=None)).writes
+    assert not loop.scan(sample(mv=200.0)).writes
+    assert loop.scan(sample(math.nan, mv=STANDS + 8)).mv.tolist() == [STANDS + 8]
+    loop = loop_on(pi_file, mode=Mode.SHADOW)
+    loop.scan(sample())
+    loop.set_mode(mode)
+    command = loop.scan(sample(mv=None))  # a plant that reads nothing back any more
+    assert command.writes
+    assert command.mv.tolist() == [STANDS]
+
+
+def test_a_command_that_did_not_arrive_as_a_shadow_ends_leaves_the_mv_where_others_moved_it(pi_file: Path) -> None:
+    loop = loop_on(pi_file, mode=Mode.SHADOW)
+    loop.scan(sample())
+    loop.set_mode(Mode.HOLD)
+    before = loop.mv
+    loop.scan(sample(mv=STANDS + 8))
+    loop.unwritten(before, "no way")
+    assert loop.scan(sample(mv=None)).mv.tolist() == [STANDS + 8]
+
+
+def test_after_a_lost_command_an_unreadable_plant_gets_no_old_mv(pi_file: Path) -> None:
+    """Others may have moved it: a read that fails tells as little as a refused sample without a read-back."""
+    loop = loop_on(pi_file, mode=Mode.MANUAL)
+    loop.scan(sample())
+    loop.unwritten(loop.mv, "no way")
+    assert not loop.miss("no route").writes
+    assert loop.scan(sample(mv=STANDS + 8)).mv.tolist() == [STANDS + 8]
+
+
 def test_what_the_operator_sets_by_hand_as_a_shadow_ends_is_written(pi_file: Path) -> None:
     loop = loop_on(pi_file, mode=Mode.SHADOW)
     loop.scan(sample())

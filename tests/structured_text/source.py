@@ -19,6 +19,7 @@ from blark import transform as tree
 from blark.parse import get_parser
 
 LIST = re.compile(r"(?P<name>\w+) : ARRAY\[0\.\.(?P<last>\d+)\] OF (?P<of>\w+) := \[(?P<list>[^\]]*)\];")
+ARRAY_TYPE = re.compile(r"^TYPE (?P<name>\w+) : (?P<array>ARRAY\[0\.\.\d+\] OF (?:LREAL|DINT|BOOL));\nEND_TYPE$", re.M)
 LITERAL = re.compile(r"-?\d+\.\d+(E[+-]\d\d+)?|-?\d+|TRUE|FALSE")
 FIRST = 987654000  # of the numbers that stand for others
 BEGINS, ENDS = re.compile(r"(FOR|IF|CASE|WHILE|REPEAT)\b"), re.compile(r"END_(FOR|IF|CASE|WHILE|REPEAT)\b")
@@ -46,7 +47,7 @@ class Unit:
 
 def units_of(text: str) -> list[Unit]:
     """All of a source file, in its order."""
-    text = re.sub(r"\(\*.*?\*\)", "", text, flags=re.S)
+    text = _arrays_in_place(re.sub(r"\(\*.*?\*\)", "", text, flags=re.S))
     found = re.compile(r"^(FUNCTION_BLOCK|FUNCTION|PROGRAM|TYPE)\b[^\n]*\n.*?^END_\1\b;?", re.S | re.M).finditer(text)
     ends, units = 0, []
     for unit in found:
@@ -55,6 +56,16 @@ def units_of(text: str) -> list[Unit]:
         units.append(_unit(unit[0]))
     assert not text[ends:].strip(), text[ends:]
     return units
+
+
+def _arrays_in_place(text: str) -> str:
+    """The text with each array type, which blark reads, in the place of its name."""
+    for found in list(ARRAY_TYPE.finditer(text)):
+        declared = parsed(found[0].strip(), "iec_source").items[0].declaration
+        assert isinstance(declared, tree.ArrayTypeDeclaration)
+        assert str(declared.name) == found["name"]
+        text = re.sub(rf" : {found['name']}\b", f" : {found['array']}", text.replace(found[0], ""))
+    return text
 
 
 def _unit(text: str) -> Unit:

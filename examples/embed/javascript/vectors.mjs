@@ -48,8 +48,8 @@ async function medianStep(controller, given) {
 
 // {answers, words, passed}: the answers for `loopwright conformance FILE OUT --check`, and the result in words.
 export async function conform(ort, provider, bytes, manifest, vectors, host, version) {
-  if (vectors.kit !== 4)
-    throw new Error(`the kit has the version ${vectors.kit}, not 4: write it again with loopwright conformance FILE.onnx KIT`);
+  if (vectors.kit !== 5)
+    throw new Error(`the kit has the version ${vectors.kit}, not 5: write it again with loopwright conformance FILE.onnx KIT`);
   const controller = await Controller.load(ort, bytes, manifest, provider);
   if (manifest.sha256 !== vectors.sha256) throw new Error("the vectors are of another controller file");
   const scale = Object.fromEntries(OUTPUTS.map((name) => [name, numbers(vectors.scale[name])]));

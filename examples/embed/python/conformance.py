@@ -16,8 +16,8 @@ kit = Path(sys.argv[1] if sys.argv[1:] else sys.exit("usage: python conformance.
 vectors = json.loads((kit / "vectors.json").read_text())
 controller = Controller(kit / vectors["file"], sha256=vectors["sha256"])
 differences, wrong, took = {"one step": [0.0], "chained": [0.0]}, 0, []
-if vectors["kit"] != 4:
-    sys.exit(f"{kit} has the version {vectors['kit']}, not 4: write it again with loopwright conformance FILE.onnx KIT")
+if vectors["kit"] != 5:
+    sys.exit(f"{kit} has the version {vectors['kit']}, not 5: write it again with loopwright conformance FILE.onnx KIT")
 
 
 def numbers(texts):

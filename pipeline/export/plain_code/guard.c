@@ -63,7 +63,7 @@ static int may_move(int k, double applied, double value)
 /* Whether it is known where the MV stands. */
 static int placed(const lower_loop *l)
 {
-    return l->known && !l->lost;
+    return l->known && !l->lost && !l->taken;
 }
 
 static void cold(lower_loop *l)
@@ -192,20 +192,23 @@ static int to_come_allowed(const lower_loop *l, const double *dv)
 }
 #endif
 
-/* Where the MV stands after a command that did not arrive: at the next sound read-back, also of a sample that is refused
-   for another reason. A good sample without one says that nothing is read back: the MV before it stays. */
+/* Where the MV stands after a command that did not arrive, and after others had it: at the next sound read-back, also of a
+   sample that is refused for another reason. A good sample without one says that nothing is read back: the MV before it
+   stays. */
 static void find(lower_loop *l, const lower_sample *s, int good_one)
 {
-    if (!l->lost || (!s->has_mv_applied && !good_one)) {
+    const int back = s->has_mv_applied;
+    const int sound = back && implausible(s->mv_applied) == UPPER_N_MV;
+    const int blind = sound && l->by_hand && !l->known; /* until now on a way by hand from nobody knows where */
+    if (!(l->lost || l->taken || blind) || !(back || good_one)) {
         return;
     }
-    l->lost = s->has_mv_applied && implausible(s->mv_applied) < UPPER_N_MV;
-    l->by_hand = l->by_hand && !s->has_mv_applied; /* it stays where it is found */
-    for (int k = 0; k < UPPER_N_MV && s->has_mv_applied && !l->lost; ++k) {
+    l->by_hand = l->by_hand && !(l->lost && back); /* it stays where it is found */
+    l->known = back ? sound : l->known;
+    l->lost = l->lost && back && !sound;
+    l->taken = l->taken && back && !sound;
+    for (int k = 0; k < UPPER_N_MV && sound; ++k) {
         l->mv[k] = inside(s->mv_applied[k], UPPER_MV_LOW[k], UPPER_MV_HIGH[k]);
-    }
-    if (s->has_mv_applied) {
-        l->known = !l->lost;
     }
 }
 
@@ -305,6 +308,7 @@ static void take(lower_loop *l, const lower_sample *s)
     for (k = 0; k < UPPER_N_MV; ++k) {
         l->before[k] = l->mv[k];
     }
+    l->was_known = l->known;
     if (s == NULL || !good_one) {
         return;
     }
@@ -386,8 +390,10 @@ void lower_begin(lower_loop *l, lower_mode mode, long recover_after)
     l->good = 0;
     l->held = 0;
     l->lost = 0;
+    l->taken = 0;
     l->by_hand = 0;
     l->known = 0;
+    l->was_known = 0;
     l->max_gap = 3.0;
 }
 
@@ -433,12 +439,14 @@ int lower_set_mv(lower_loop *l, const double *mv)
         }
     }
     l->known = l->known || !l->by_hand;
+    l->taken = l->taken && l->by_hand; /* else it is where it was sent */
     return 1;
 }
 
 void lower_set_mode(lower_loop *l, lower_mode mode)
 {
     l->by_hand = l->by_hand && l->mode == mode;
+    l->taken = mode != UPPER_SHADOW && (l->taken || l->mode == UPPER_SHADOW);
     l->mode = mode;
     l->held = 0;
     l->good = 0;
@@ -473,9 +481,11 @@ void lower_gap(lower_loop *l, double periods)
 
 void lower_unwritten(lower_loop *l)
 {
-    for (int k = 0; k < UPPER_N_MV && (l->mode != UPPER_MANUAL || l->by_hand); ++k) {
+    const int back = l->mode != UPPER_MANUAL || l->by_hand; /* else where it should be is where it goes */
+    for (int k = 0; k < UPPER_N_MV && back; ++k) {
         l->mv[k] = l->before[k];
     }
+    l->known = back ? l->was_known : l->known;
     l->lost = 1;
     fail(l, UPPER_NOT_WRITTEN, 0);
 }

@@ -65,7 +65,9 @@ typedef struct {
     int read[UPPER_N_PV];
     long good;
     int known;
+    int was_known; /* before the last scan */
     int lost;
+    int taken; /* others had the MV until now, and no sample has told since where it stands */
     int by_hand;
 } lower_loop;
 
@@ -82,11 +84,13 @@ void lower_gap(lower_loop *l, double periods);
 /* Before the next scan: the last MV did not reach the plant. */
 void lower_unwritten(lower_loop *l);
 
+/* After SHADOW nothing is written until a sound read-back, or a good sample without one, says where others left the MV. */
+void lower_set_mode(lower_loop *l, lower_mode mode);
+
 /* Each returns 0, and changes nothing, where a value is not allowed. An MV is the operator's in MANUAL only; it goes to
    where it is sent by at most its largest change a period. */
 int lower_set_sp(lower_loop *l, const double *sp);
 int lower_set_mv(lower_loop *l, const double *mv);
-void lower_set_mode(lower_loop *l, lower_mode mode);
 #if UPPER_N_OPERATE > 0
 int lower_set_operate(lower_loop *l, const double *operate);
 #endif

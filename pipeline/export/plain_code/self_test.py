@@ -18,7 +18,7 @@ from loopwright.serving.modes import Mode
 
 FNV_BEGIN, FNV_PRIME = 14695981039346656037, 1099511628211  # of the 64-bit hash FNV-1a
 WORD = (1 << 64) - 1  # the bits of the hash
-MODES = (Mode.MANUAL, Mode.AUTO, Mode.HOLD)
+MODES = (Mode.MANUAL, Mode.AUTO, Mode.HOLD, Mode.SHADOW)  # by their numbers in C and Structured Text
 
 
 @dataclass(frozen=True, slots=True)

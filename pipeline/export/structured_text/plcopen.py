@@ -53,6 +53,10 @@ def _first_word(unit: str) -> str:
 
 def _structure(unit: str) -> str:
     name = _COMMENT.sub("", unit).split()[1]
+    array = re.fullmatch(r"TYPE \w+ : ARRAY\[0\.\.(\d+)\] OF (\w+);\s*END_TYPE\s*", unit)
+    if array is not None:
+        base = _array_type(array[1], f"<{array[2]}/>")
+        return f"<dataType name={quoteattr(name)}><baseType>{base}</baseType></dataType>"
     fields = "".join(_variables(_COMMENT.sub("", unit)))
     return f"<dataType name={quoteattr(name)}><baseType><struct>{fields}</struct></baseType></dataType>"
 
@@ -81,13 +85,15 @@ def _variables(text: str) -> Iterator[str]:
     for found in _DECLARED.finditer(text):
         kind = found["type"]
         base = f"<{kind}/>" if kind in _ELEMENTARY else f"<derived name={quoteattr(kind)}/>"
-        if found["last"] is None:
-            declared, value = base, _simple(found["value"]) if found["value"] else ""
-        else:
-            declared = f'<array><dimension lower="0" upper="{found["last"]}"/><baseType>{base}</baseType></array>'
-            value = _array(found["value"]) if found["value"] else ""
+        declared = base if found["last"] is None else _array_type(found["last"], base)
+        given = (found["value"] or "").strip()
+        value = "" if not given else _array(given) if given.startswith("[") else _simple(given)
         initial = f"<initialValue>{value}</initialValue>" if value else ""
         yield f'<variable name="{found["name"]}"><type>{declared}</type>{initial}</variable>'
+
+
+def _array_type(last: str, base: str) -> str:
+    return f'<array><dimension lower="0" upper="{last}"/><baseType>{base}</baseType></array>'
 
 
 def _simple(value: str) -> str:

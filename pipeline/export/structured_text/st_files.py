@@ -1,4 +1,4 @@
-"""The folder of a controller in Structured Text: step, guard, data type, vectors, and all of them as PLCopen XML."""
+"""The folder of a controller in Structured Text: data types, step, guard, vectors, and all of them as PLCopen XML."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import onnx
 
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.self_test import kit_in_c
+from loopwright.pipeline.export.structured_text.array_types import with_named_arrays
 from loopwright.pipeline.export.structured_text.elementary_functions import printed_function
 from loopwright.pipeline.export.structured_text.guard_block import printed_guard, printed_operate_type
 from loopwright.pipeline.export.structured_text.iec_names import comment, lreal
@@ -28,8 +29,11 @@ def st_folder(controller: Controller, name: str) -> tuple[dict[str, str], list[s
     kit = kit_in_c(controller, program)
     step = printed_step_block(program, name)
     functions = [printed_function(name, f) for f in step.own_functions]
-    operate, guard = printed_operate_type(m, name), printed_guard(m, name, step)
-    vectors = printed_vectors_program(m, name, step, kit)
+    operate = printed_operate_type(m, name)
+    types, (law, vectors, *guard) = with_named_arrays(
+        name, [step.text, printed_vectors_program(m, name, step, kit), *printed_guard(m, name, step)]
+    )
+    types += [operate] if operate else []
     durations = estimates(step.program)
     head = (
         f"Law {m.law} of {m.case}, made of {controller.path.name} by loopwright {__version__}.\n"
@@ -39,12 +43,13 @@ def st_folder(controller: Controller, name: str) -> tuple[dict[str, str], list[s
     about = "\n".join([first, "", *_about(m, step), *(f"   {line}" for line in durations), "*)\n"])
     taken = f"{first}\n\n   {len(steps_taken(kit))} of the kit's {len(kit.given['sp'])} steps, all its scans. *)\n"
     files = {
-        f"{name}_step.st": "\n".join([about, *functions, step.text]),
-        f"{name}_guard.st": "\n".join([f"{first} *)\n", *([operate] if operate else []), *guard]),
+        f"{name}_types.st": "\n".join([f"{first} *)\n", *types]),
+        f"{name}_step.st": "\n".join([about, *functions, law]),
+        f"{name}_guard.st": "\n".join([f"{first} *)\n", *guard]),
         f"{name}_test.st": "\n".join([taken, vectors]),
     }
-    step_text = step.text.replace("FUNCTION_BLOCK", f"{about}FUNCTION_BLOCK", 1)
-    units = [*([operate] if operate else []), *functions, step_text, *guard, vectors]
+    step_text = law.replace("FUNCTION_BLOCK", f"{about}FUNCTION_BLOCK", 1)
+    units = [*types, *functions, step_text, *guard, vectors]
     files[f"{name}.xml"] = plcopen_xml(name, __version__, units)
     return files, durations
 

@@ -548,8 +548,10 @@ static bool controller_open(Controller *c, const char *path) {
 #define BRIDGE_PERIODS 10     /* a law's own prediction is as good as its model, and loads go on unseen meanwhile */
 #define READ_BACK_MARGIN 0.02 /* share of an MV's range by which scaling may carry a sound read-back over its ends */
 
-typedef enum { MANUAL, AUTO, HOLD } Mode; /* the MV is the operator's, the law's, the last one after a fault */
-static const char *const MODE[] = {"MANUAL", "AUTO", "HOLD"};
+/* The MV is the operator's, the law's, the last one after a fault, or others': in SHADOW nothing is written, and l->mv
+   follows what is read back. */
+typedef enum { MANUAL, AUTO, HOLD, SHADOW, MODES } Mode;
+static const char *const MODE[MODES] = {"MANUAL", "AUTO", "HOLD", "SHADOW"};
 
 typedef struct {
   const double *pv, *dv, *mv_applied; /* mv_applied NULL: there is no read-back */
@@ -563,6 +565,7 @@ typedef struct {
   int recover_after; /* good samples after which HOLD returns to AUTO; 0: only the operator returns it */
   int good;
   bool lost;      /* the last command did not reach the plant, and nothing has told since where the MV stands */
+  bool taken;     /* others had the MV until now, and nothing has told since where it stands */
   double max_gap; /* missed periods in a row after which the law starts cold */
   double *sp, *mv, *applied, *before; /* mv is NAN while nobody knows where it stands */
   /* By PV, for a law that reads fresh: the last good number, periods since then, whether it is bad, predicted, or left
@@ -577,9 +580,12 @@ typedef struct {
   char reason[WORDS]; /* of the last scan; empty: no fault */
 } Loop;
 
-/* Whether l->mv may be written: not before the first good sample with a read-back, or loop_set; nor after a command that
-   did not arrive, until a read-back tells where the MV stands. */
-static bool loop_writes(const Loop *l) { return !isnan(l->mv[0]) && !l->lost; }
+/* Whether it is known where the MV stands: not before the first good sample with a read-back, or loop_set; nor after a
+   command that did not arrive, or after SHADOW, until a read-back tells. */
+static bool loop_placed(const Loop *l) { return !isnan(l->mv[0]) && !l->lost && !l->taken; }
+
+/* Whether l->mv may be written. */
+static bool loop_writes(const Loop *l) { return loop_placed(l) && l->mode != SHADOW; }
 
 static bool loop_open(Loop *l, Controller *c, Mode mode, int recover_after) {
   size_t n = c->n_in[PV] + 1;
@@ -636,6 +642,7 @@ static bool loop_set(Loop *l, int which, const double *values) {
   l->by_hand = l->by_hand && which == SP;
   for (size_t i = 0; which == MV && l->mode == MANUAL && i < signals->n; i++)
     l->by_hand = l->by_hand || signals->at[i].max_move < INFINITY;
+  l->taken = l->taken && (which == SP || l->by_hand); /* else the MV is where it was sent */
   memcpy(which == SP ? l->sp : l->by_hand ? l->wanted : l->mv, values, signals->n * sizeof *values);
   return true;
 }
@@ -656,6 +663,7 @@ static void loop_by_hand(Loop *l) {
 
 static void loop_set_mode(Loop *l, Mode mode) {
   l->by_hand = l->by_hand && l->mode == mode;
+  l->taken = mode != SHADOW && (l->taken || l->mode == SHADOW);
   l->mode = mode;
   l->fault = false;
   l->good = 0;
@@ -734,17 +742,18 @@ static bool trusted(Controller *c, const Sample *sample, bool *bad) {
   return true;
 }
 
-/* Where the MV stands after a command that did not arrive: at the next sound read-back, also that of a sample which is
-   refused for another reason. A good sample without one says that nothing is read back: the MV before it stays. After an
-   implausible one the old MV is nothing to go back to. */
+/* Where the MV stands after a command that did not arrive, and after others had it: at the next sound read-back, also that
+   of a sample which is refused for another reason. A good sample without one says that nothing is read back: the MV before
+   it stays. After an implausible one the old MV is nothing to go back to. */
 static void loop_found(Loop *l, const double *applied, bool good_one) {
-  if (!l->lost || (!applied && !good_one)) return;
-  l->lost = applied && implausible(l->c, applied) < l->c->n_in[MV];
-  l->by_hand = l->by_hand && !applied; /* it stays where it is found */
-  if (l->lost)
-    for (size_t k = 0; k < l->c->n_in[MV]; k++) l->mv[k] = NAN;
-  else if (applied)
-    clip(l->c, applied, l->mv);
+  bool sound = applied && implausible(l->c, applied) == l->c->n_in[MV];
+  bool blind = sound && l->by_hand && isnan(l->mv[0]); /* until now on a way by hand from nobody knows where */
+  if (!(l->lost || l->taken || blind) || (!applied && !good_one)) return;
+  l->by_hand = l->by_hand && !(l->lost && applied); /* it stays where it is found */
+  l->lost = l->lost && applied && !sound;
+  l->taken = l->taken && applied && !sound;
+  if (sound) clip(l->c, applied, l->mv);
+  for (size_t k = 0; applied && !sound && k < l->c->n_in[MV]; k++) l->mv[k] = NAN;
 }
 
 /* The place in operate of a PV's use; n_in[OPERATE] where it has none. */
@@ -815,12 +824,12 @@ static void loop_take(Loop *l, const Sample *sample) {
     loop_fault(l, sample ? c->words : "the plant cannot be read");
     return;
   }
-  if (!sample->mv_applied && !loop_writes(l)) {
+  if (!sample->mv_applied && !loop_placed(l)) {
     loop_fault(l, "there is no read-back, so where the MV stands is not known and nothing is written");
     return;
   }
   clip(c, sample->mv_applied ? sample->mv_applied : l->mv, l->applied);
-  if (!loop_writes(l)) memcpy(l->mv, l->applied, n * sizeof *l->mv);
+  if (!loop_placed(l) || l->mode == SHADOW) memcpy(l->mv, l->applied, n * sizeof *l->mv);
   const double *const given[STATE] = {[SP] = l->sp, [PV] = apart ? l->pv : sample->pv, [DV] = sample->dv, [MV] = l->applied};
   if (loop_step(l, given) != STEPPED) {
     if (l->mode == AUTO) memcpy(l->mv, l->applied, n * sizeof *l->mv);
@@ -1007,7 +1016,7 @@ static bool kit_step(Controller *c, Run run, const Json *row, const Json *scale,
 static bool kit_scan(Loop *l, const Json *row, const Json *scale, double *room[INPUTS], FILE *out, Tally *t) {
   Controller *c = l->c;
   const Json *given = json_get(row, "sample");
-  for (int i = 0; i < 3; i++)
+  for (int i = 0; i < MODES; i++)
     if (!strcmp(json_word(row, "set_mode"), MODE[i])) loop_set_mode(l, (Mode)i);
   const Json *unwritten = json_get(row, "unwritten"); /* the command of the scan before did not arrive */
   if (unwritten && unwritten->kind == J_TRUE) loop_unwritten(l, "the plant cannot be written");
@@ -1101,8 +1110,8 @@ static int conformance(const char *folder, const char *answers) {
     return 2;
   }
   double version = json_number(json_get(&kit, "kit"));
-  if (version != 4) {
-    fprintf(stderr, "error: the kit has the version %g, not 4: write it again with loopwright conformance FILE.onnx KIT\n", version);
+  if (version != 5) {
+    fprintf(stderr, "error: the kit has the version %g, not 5: write it again with loopwright conformance FILE.onnx KIT\n", version);
     json_free(&kit);
     return 2;
   }

@@ -279,7 +279,7 @@ class Bridging {
 }
 
 export class Loop {
-  // mode: MANUAL the operator's MV, AUTO the law's, HOLD the last one after a fault. `sp` and `mv` lie in their ranges.
+  // mode: MANUAL the operator's MV, AUTO the law's, HOLD the last one after a fault, SHADOW others': nothing is written. `sp` and `mv` lie in their ranges.
   // `mv` is what the plant has now; null: not known, so nothing is written until a good sample has a read-back.
   // recoverAfter: good samples after which HOLD returns to AUTO; null: only the operator returns it.
   // bridgeS, critical: seconds for which the bad reading of a PV is bridged (ten periods), and names of PVs without which the
@@ -288,6 +288,7 @@ export class Loop {
     Object.assign(this, { controller, mode, recoverAfter, maxGap, fault: "", good: 0, state: controller.cold() });
     this.bridging = new Bridging(controller.manifest, bridgeS, critical);
     this.lost = false; // the last command did not reach the plant, and nothing has told since where the MV stands
+    this.taken = false; // others had the MV until now, and nothing has told since where it stands
     this.sp = within(sp, controller.manifest.sp, "set point");
     this.mv = this.before = mv && within(mv, controller.manifest.mv, "MV");
     this.operate = controller.operate.default; // see setOperate
@@ -298,6 +299,7 @@ export class Loop {
 
   setMode(mode) {
     if (mode !== this.mode) this.wanted = null;
+    this.taken = mode !== "SHADOW" && (this.taken || this.mode === "SHADOW");
     Object.assign(this, { mode, fault: "", good: 0 });
   }
 
@@ -316,7 +318,7 @@ export class Loop {
     if (this.lost) throw new Refused("the last MV did not reach the plant, so where the MV stands is not known; wait");
     const signals = this.controller.manifest.mv, wanted = within(mv, signals, "MV");
     if (signals.some(limits)) this.wanted = wanted;
-    else this.mv = wanted;
+    else Object.assign(this, { mv: wanted, taken: false });
   }
 
   // Another controller takes over; it has no past. It has by name what somebody has set of `operate`, and its own defaults for
@@ -336,7 +338,7 @@ export class Loop {
   }
 
   // One period. sample: {pv, dv, mv_applied or null, age_s, and fresh where not all readings are}, or null where the plant could not be read. Nothing that it
-  // holds throws. -> {mode, mv, law, info, reason}; mv is null while it is not known where the MV stands: then write nothing.
+  // holds throws. -> {mode, mv, law, info, reason}; mv is null in SHADOW, and while it is not known where the MV stands: then write nothing.
   // Where the readings of single PVs are bad and the law goes on, `bridged` and `shed` say of which, and why.
   async scan(sample) {
     let given = null, reason = "the plant cannot be read", readings = null;
@@ -356,7 +358,7 @@ export class Loop {
     if (!reason && !given.mv_applied && !this.mv) reason = UNKNOWN;
     if (reason) return this.#miss(reason);
     const applied = given.mv_applied ? this.#clipped(given.mv_applied) : this.mv;
-    this.mv ??= applied;
+    if (!this.mv || this.mode === "SHADOW") this.mv = applied;
     let step;
     try {
       const { pv, fresh, operate } = readings ?? { pv: given.pv, operate: this.operate };
@@ -370,7 +372,7 @@ export class Loop {
     if (this.mode === "AUTO") this.mv = Array.from(step.mv);
     this.#byHand();
     const { bridged = {}, shed = {} } = readings ?? {};
-    return { mode: this.mode, mv: [...this.mv], law: Array.from(step.mv), info: Array.from(step.info), reason: this.fault, bridged, shed };
+    return { mode: this.mode, mv: this.#written(), law: Array.from(step.mv), info: Array.from(step.info), reason: this.fault, bridged, shed };
   }
 
   // The command in place of the last one, which never reached the plant. Others may move the MV meanwhile: nothing is
@@ -381,23 +383,30 @@ export class Loop {
     return this.#miss(reason);
   }
 
-  // Where the MV stands after a command that did not arrive: at the next sound read-back, also that of a sample which is
-  // refused for another reason. A good sample without one says that nothing is read back: the MV before it stays. After an
-  // implausible one the old MV is nothing to go back to.
+  // Where the MV stands after a command that did not arrive, and after others had it: at the next sound read-back, also that
+  // of a sample which is refused for another reason. A good sample without one says that nothing is read back: the MV before
+  // it stays. After an implausible one the old MV is nothing to go back to.
   #found(given, reason) {
-    const applied = given?.mv_applied;
-    if (!this.lost || (!applied && reason)) return;
-    this.lost = Boolean(applied && this.#implausible(applied));
-    if (applied) this.wanted = null; // it stays where it is found
-    if (applied) this.mv = this.lost ? null : this.#clipped(applied);
+    const applied = given?.mv_applied, sound = applied && !this.#implausible(applied);
+    const blind = sound && this.wanted && !this.mv; // until now on a way by hand from nobody knows where
+    if (!(this.lost || this.taken || blind) || (!applied && reason)) return;
+    if (applied && this.lost) this.wanted = null; // it stays where it is found
+    if (applied) this.mv = sound ? this.#clipped(applied) : null;
+    this.lost &&= Boolean(applied && !sound);
+    this.taken &&= Boolean(applied && !sound);
+  }
+
+  // The MV that is to be written, else null.
+  #written() {
+    return this.lost || this.taken || this.mode === "SHADOW" ? null : this.mv && [...this.mv];
   }
 
   // No past any more. In AUTO a fault: the MV is held until recoverAfter good samples, or until the operator acts.
   #miss(reason) {
     Object.assign(this, { state: this.controller.cold(), good: 0 });
     if (this.mode === "AUTO" || this.fault) Object.assign(this, { mode: "HOLD", fault: reason });
-    if (!this.lost) this.#byHand();
-    return { mode: this.mode, mv: this.lost ? null : this.mv && [...this.mv], law: null, info: null, reason };
+    if (!this.lost && !this.taken) this.#byHand();
+    return { mode: this.mode, mv: this.#written(), law: null, info: null, reason };
   }
 
   // One period nearer to where an operator sent the MV.

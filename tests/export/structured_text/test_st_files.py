@@ -18,6 +18,7 @@ from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.export.structured_text.iec_names import array_of, field_names, lreal, require_st_name, typed
 
 PID = next(f for f in SOME if name(f) == "thiosulfate_cstr-pid")
+PARTS = ("types", "step", "guard", "test")
 SPACE = "{http://www.plcopen.org/xml/tc6_0200}"
 
 
@@ -28,7 +29,7 @@ def written(file: Path, folder: Path) -> dict[str, str]:
 
 def verdict(files: dict[str, str]) -> tuple[int, int]:
     """Wrong steps and wrong scans, after the test program has run through."""
-    text = "\n".join(files[f"tank_{part}.st"] for part in ("step", "guard", "test"))
+    text = "\n".join(files[f"tank_{part}.st"] for part in PARTS)
     program = Machine(text).make("tank_test")
     cycles = 0
     while not program.done:
@@ -56,9 +57,9 @@ def test_the_vectors_of_a_pid_find_no_fault(tmp_path: Path) -> None:
 def test_the_vectors_of_a_law_that_operators_steer_find_no_fault(steered: dict[str, str]) -> None:
     assert verdict(steered) == (0, 0)
     assert (
-        "TYPE tank_operate :\nSTRUCT\n    y0_use : LREAL := 1.0; (* y0.use, 0.0 to 1.0 *)\n" in steered["tank_guard.st"]
+        "TYPE tank_operate :\nSTRUCT\n    y0_use : LREAL := 1.0; (* y0.use, 0.0 to 1.0 *)\n" in steered["tank_types.st"]
     )
-    assert "\n    y1_low : LREAL := -0.5;" in steered["tank_guard.st"]
+    assert "\n    y1_low : LREAL := -0.5;" in steered["tank_types.st"]
 
 
 def test_the_vectors_find_a_wrong_digit_and_a_wrong_guard(tmp_path: Path) -> None:
@@ -77,7 +78,7 @@ def blocks_of(xml: str) -> dict[str, ElementTree.Element]:
 
 
 def test_xml_holds_the_same_blocks(steered: dict[str, str]) -> None:
-    text = "\n".join(steered[f"tank_{part}.st"] for part in ("step", "guard", "test"))
+    text = "\n".join(steered[f"tank_{part}.st"] for part in PARTS)
     machine, found = Machine(text), blocks_of(steered["tank.xml"])
     assert set(found) == {n for n, unit in machine.units.items() if unit.kind != "TYPE"}
     for unit, pou in found.items():
@@ -95,6 +96,24 @@ def test_xml_holds_the_same_blocks(steered: dict[str, str]) -> None:
         assert lines[-1] in text
     structure = next(ElementTree.fromstring(steered["tank.xml"]).iter(f"{SPACE}struct"))
     assert [v.attrib["name"] for v in structure] == list(machine.fields["tank_operate"])
+
+
+def test_arrays_of_variables_have_named_types(steered: dict[str, str]) -> None:
+    declared = set(re.findall(r"TYPE (tank_\w+) : ARRAY", steered["tank_types.st"]))
+    assert {"tank_lreal_2", "tank_bool_2"} <= declared
+    for part in ("step", "guard", "test"):
+        variables, constant = [], False
+        for line in steered[f"tank_{part}.st"].splitlines():
+            constant = line == "VAR CONSTANT" or (constant and line != "END_VAR")
+            variables += [] if constant else re.findall(r"^    \w+ : (tank_\w+_\d+|ARRAY.*?);", line)
+        assert set(variables) <= declared
+        assert variables
+    project = ElementTree.fromstring(steered["tank.xml"])
+    types = {t.attrib["name"]: t for t in project.iter(f"{SPACE}dataType")}
+    assert set(types) == {*declared, "tank_operate"}
+    assert next(types["tank_lreal_2"].iter(f"{SPACE}dimension")).attrib == {"lower": "0", "upper": "1"}
+    used = {d.attrib["name"] for d in project.iter(f"{SPACE}derived")}
+    assert used - declared <= {"tank_operate", "tank_step", "tank_guard"}
 
 
 def test_every_name_is_legal_in_all_three_systems(steered: dict[str, str]) -> None:
