@@ -310,12 +310,13 @@ class LawInputs:
 
     ``values`` are by the inputs' names, of the loop's signals; ``unread_s`` (n_pv,) is the time since each PV was read
     well, 0 where it was for this step. ``operate`` is as operators and the plant have it; the step itself may pin an MV
-    that is out of use to what is commanded of it.
+    that is out of use to what is commanded of it. ``course_s`` [s] is when it was, as the courses count the time.
     """
 
     values: Mapping[str, Array]
     unread_s: Array
     operate: Array
+    course_s: float
 
 
 class ActiveController:
@@ -405,7 +406,7 @@ class ActiveController:
         read = self.controller.manifest.inputs  # another one may hold anything
         values = {n: np.array(given[n], dtype=np.float64) for n in read if n in given}  # hosts reuse their arrays
         steered = np.array(self.mv_entries.told(wanted, out, None, None))
-        self.stepped = LawInputs(values, self._bridging.unread_s, steered)
+        self.stepped = LawInputs(values, self._bridging.unread_s, steered, self.courses.now_s)
         if self._past.maxlen:
             self._past.append(replace(sample, pv=np.array(sample.pv)))  # the host may reuse its array
         self._state, self._given = step.state, np.array(step.mv)  # the host gets step.mv, may write into it

@@ -121,7 +121,7 @@ def test_the_request_inputs_is_answered_at_the_door(running: RunningLoop) -> Non
 def test_before_the_first_step_there_are_no_inputs() -> None:
     with pytest.raises(LoopError):
         inputs(SimpleNamespace(snapshot=None))  # type: ignore[arg-type]
-    assert set(VIEWS) == {"about", "state", "inputs", "courses", "picture"}
+    assert set(VIEWS) == {"about", "state", "inputs", "future", "courses", "picture"}
 
 
 @pytest.mark.parametrize(
