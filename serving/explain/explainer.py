@@ -32,6 +32,7 @@ from loopwright.serving.ranges import numbers, within
 
 Array: TypeAlias = NDArray[np.float64]
 NO_PART = 1e-13  # of an MV's range: a smaller part is none
+AT_LIMIT = 1e-6  # of an MV's range: nearer to a limit is at it
 # Share of an MV's range by which both graphs may differ and be one law. They round apart, and where the plan hardly
 # bends rounding grows: on a served tank with three valves for two variables by more than 1e-9.
 SAME_MV = 1e-6
@@ -261,16 +262,36 @@ class Explainer:
         rests = {e.signal: v for e, v in zip(m.operate, operate, strict=True) if (e.group, e.what) == ("mv", "rest")}
         applied = np.array(given.mv_applied, dtype=np.float64, ndmin=1).tolist()
         to_rest = {s.name: rests[s.name] - at for s, at in zip(m.mv, applied, strict=True) if s.name in rests}
-        rows = found["parts"].reshape(len(m.mv), len(causes))
+        rows, later = found["parts"].reshape(len(m.mv), len(causes)), self._limits_reached(found, operate, applied)
         moves = []
         for s, move, row in zip(m.mv, found["move"].tolist(), rows.tolist(), strict=True):
             span = s.high - s.low
-            parts = [MovePart(cast("Cause", c), n, v) for (c, n), v in zip(causes, row, strict=True)]
+            parts = [
+                MovePart(cast("Cause", c), n, v, later.get((c, n), 0.0)) for (c, n), v in zip(causes, row, strict=True)
+            ]
             parts = sorted((p for p in parts if abs(p.value) > NO_PART * span), key=lambda p: -abs(p.value))
             parts = parts or [MovePart("not_in_use", s.name, move) if s.name in idle else MovePart("plan", "", move)]
             words = sentence_of(move, span, parts, news, {s.name: to_rest.get(s.name, 0.0)})
             moves.append(ExplainedMove(s.name, s.unit, move, tuple(parts), words))
         return tuple(moves)
+
+    def _limits_reached(
+        self, found: Mapping[str, Array], operate: Array, applied: list[float]
+    ) -> dict[tuple[str, str], float]:
+        """Time [s] until each MV is at a limit by its plan, by cause and signal; 0 where it is now, or next."""
+        m, reached = self.manifest, dict[tuple[str, str], float]()
+        z = found["z"].reshape(len(self.explains.starts), len(m.mv)).copy()
+        z[0] = found["mv"]  # within the limits, where the plan is so up to rounding
+        set_ends: dict[tuple[str, str], float] = {
+            (e.signal, e.what): v for e, v in zip(m.operate, operate.tolist(), strict=True) if e.group == "mv"
+        }
+        for i, s in enumerate(m.mv):
+            course, slack = np.array([applied[i], *z[:, i]]), AT_LIMIT * (s.high - s.low)
+            high, low = (set_ends.get((s.name, end), own) for end, own in (("high", s.high), ("low", s.low)))
+            for cause, room in (("mv_high", min(high, s.high) - course), ("mv_low", course - max(low, s.low))):
+                place = int(np.argmin(np.maximum(room, slack)))  # the first one at the limit, else the nearest
+                reached[cause, s.name] = m.period_s * self.explains.starts[max(0, place - 1)]
+        return reached
 
     def _run(self, given: _Given, samples: int) -> Explanation:
         """The closed loop over the law's model from here: moves of the first step, courses of so many samples."""
