@@ -278,5 +278,5 @@ function askBack(signal) {
 }
 
 // Courses of the signals after a change, where the law can be asked for it.
-export const foresee = (changes) => whatIf({ changes }, signals, range);
-export const foreseeCourse = (course) => whatIf({ course }, signals, range);
+export const foresee = (changes) => whatIf({ changes }, signals, value);
+export const foreseeCourse = (course) => whatIf({ course }, signals, value);

@@ -8,13 +8,13 @@ const STILL = 2e-3; // of a signal's range: what moves by more over the last fif
 const [WIDE, TALL] = [88, 24]; // pixels of the lines beside a name
 
 // A table of what the signals would do, beside what they do without it, and what it does not show; null where the law
-// cannot be asked. body: {changes: values by name}, or {course: as a loop is given one}. ranges(signal): [low, high] that
-// operators have set, or null.
-export function whatIf(body, signals, ranges) {
-  return foresees() ? looked(body, signals, ranges) : null;
+// cannot be asked. body: {changes: values by name}, or {course: as a loop is given one}. value(name): an entry of operate,
+// undefined where there is none.
+export function whatIf(body, signals, value) {
+  return foresees() ? looked(body, signals, value) : null;
 }
 
-async function looked(body, signals, ranges) {
+async function looked(body, signals, value) {
   const { before, after, course_s } = await foresee(body);
   const changes = body.changes || {};
   const values = (of, signal) => of.courses.find((c) => c.signal === signal.name)?.values;
@@ -32,7 +32,8 @@ async function looked(body, signals, ranges) {
     element("tbody", {}, ...rows.map((s) => element("tr", {}, element("th", { scope: "row" }, s.name, lines(s)), cell(s, before), cell(s, after), element("td", {}, between(s))))),
   );
   const notes = [
-    ...rows.flatMap((s) => unheld(s, changes, values(after, s), ranges(s), last)),
+    ...rows.flatMap((s) => unheld(s, changes, values(after, s), value, last)),
+    ...resting(rows, changes, (s) => values(after, s), value),
     ...onward(rows, changes, (s) => values(after, s), last),
     ...(course_s > last ? [`The course goes on until ${duration(course_s)} from now. Nothing after ${duration(last)} is looked at.`] : []),
   ];
@@ -63,13 +64,25 @@ const fifth = (of) => of.at(-1) - of.at(-1 - Math.ceil(of.length / 5));
 const way = (s, of) => (Math.abs(fifth(of)) <= STILL * (s.high - s.low) ? "" : fifth(of) > 0 ? "rises" : "falls");
 
 // A variable that the change takes out: whether it leaves its range, or goes on and on, as a level does.
-function unheld(s, changes, course, range, last) {
+function unheld(s, changes, course, value, last) {
   if (changes[`${s.name}.use`] !== 0) return [];
-  const [low, high] = ["low", "high"].map((end, k) => changes[`${s.name}.${end}`] ?? range?.[k] ?? s[end]);
+  const [low, high] = ["low", "high"].map((end) => changes[`${s.name}.${end}`] ?? value(`${s.name}.${end}`) ?? s[end]);
   const gone = course.findIndex((v) => v < low || v > high);
   if (gone < 0) return [`Nothing holds ${s.name} then.${way(s, course) && ` After ${duration(last)} it still ${way(s, course)}.`}`];
   const time = duration(((gone + 1) * last) / course.length);
   return [`▲ Nothing holds ${s.name} then: after ${time} it is ${course[gone] > high ? "above" : "below"} its range, ${number(low, s)} … ${number(high, s)} ${unit(s)}`.trim() + "."];
+}
+
+// MVs that go to their resting values once a variable is taken out: they take it with them, as an outlet does a level.
+function resting(rows, changes, course, value) {
+  const out = rows.filter((s) => changes[`${s.name}.use`] === 0).map((s) => s.name);
+  const of = (s, what) => changes[`${s.name}.${what}`] ?? value(`${s.name}.${what}`);
+  const going = rows.filter((s) => {
+    const [rest, from, to] = [of(s, "rest"), course(s)[0], course(s).at(-1)];
+    return of(s, "use") === 1 && of(s, "rest_use") === 1 && Math.abs(to - rest) + STILL * (s.high - s.low) < Math.abs(from - rest);
+  });
+  if (!out.length) return [];
+  return going.map((s) => `${s.name} goes to its resting value, ${number(of(s, "rest"), s)} ${unit(s)}`.trim() + `, whatever that does to ${out.join(", ")}.`);
 }
 
 // The end of the horizon is not the end of what happens.
