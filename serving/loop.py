@@ -10,12 +10,13 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.active_controller import ActiveController, Guards, LawInputs, Successor
 from loopwright.serving.clock import Clock, MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Guard, Sample, default_guards, reworded
+from loopwright.serving.in_charge.active_controller import ActiveController, Guards, LawInputs
+from loopwright.serving.in_charge.successor import Successor
 from loopwright.serving.modes import Command, Fallback, LoopMode, Mode, Transfer, mode_of
 from loopwright.serving.mv_readback import AppliedMV
 from loopwright.serving.mvs.out_of_use import OutOfUse

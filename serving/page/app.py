@@ -20,10 +20,10 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from loopwright.serving.active_controller import require_fits
 from loopwright.serving.controller_file import controller_files, file_digest, unseal
 from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
 from loopwright.serving.graph.audit import MAX_GRAPH_BYTES, audit
+from loopwright.serving.in_charge.adapted import require_fits
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 from loopwright.serving.monitor.weekly_report import plain_rows, week_reports

@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
-from loopwright.serving.active_controller import require_fits
 from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import is_number, nearest, shown
+from loopwright.serving.in_charge.adapted import require_fits
 from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import ControlLoop, Mode, within
 from loopwright.serving.manifest import Signal

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from loopwright.serving.active_controller import LawInputs
 from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample
+from loopwright.serving.in_charge.active_controller import LawInputs
 from loopwright.serving.journal import columns
 from loopwright.serving.loop import Command, ControlLoop
 from loopwright.serving.monitor import Verdict

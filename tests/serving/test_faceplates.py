@@ -15,8 +15,8 @@ from plant_servers import RunningLoop
 from processes import within
 
 from loopwright.serving import Controller, ControlLoop, LoopError, Mode, Sample
-from loopwright.serving.active_controller import AdaptedController
 from loopwright.serving.errors import ContractError
+from loopwright.serving.in_charge.adapted import AdaptedController
 from loopwright.serving.monitor import Monitor
 from loopwright.serving.page.foresight import LawForesight
 from loopwright.serving.page.prometheus import metrics_text
