@@ -138,11 +138,18 @@ class ActiveController:
         return step
 
     def learn(self, commanded: Array) -> None:
-        """Let the law go on from what is ``commanded`` (n_mv,) after its last step, where that is not what it gave."""
+        """Let the law go on from what is ``commanded`` (n_mv,) after its last step, where that is not what it gave.
+
+        The MV of this scan is known already: where the law raises, the next one begins without a past.
+        """
         if self._inputs is None or self._given is None:
             return
         given, out = self._inputs
-        learnt = learnt_step(self.controller, self.mv_entries, given, self._given, commanded, out)
+        try:
+            learnt = learnt_step(self.controller, self.mv_entries, given, self._given, commanded, out)
+        except Exception as error:
+            self.begin_cold(first_line(error))
+            return
         if learnt is not None:
             self._state, self._given = learnt.state, np.array(learnt.mv)
 
