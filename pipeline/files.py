@@ -11,11 +11,11 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from loopwright.pipeline.errors import PipelineError
+from loopwright.pipeline.errors import HostError, PipelineError
 
 
 @contextlib.contextmanager
@@ -61,6 +61,25 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_text(path: Path, content: str) -> None:
     """Write a text in UTF-8, whole or not at all."""
     write_bytes(path, content.encode("utf-8"))
+
+
+def require_new_folder(path: Path) -> None:
+    """HostError where something lies at ``path`` already."""
+    if path.exists():
+        raise HostError(f"{path} is there already; remove it, or name another folder")
+
+
+def write_text_folder(path: Path, texts: Mapping[str, str]) -> str:
+    """Write a folder of ``texts`` by file name, whole or not at all; its files and their size in words."""
+    with draft_folder_of(path) as draft:
+        for name, text in texts.items():
+            write_text(draft / name, text)
+    return f"{', '.join(texts)}, {size_words(sum(len(text.encode()) for text in texts.values()))}"
+
+
+def size_words(size_bytes: int) -> str:
+    """A size of a file in words, in kB of 1,000 bytes."""
+    return f"{size_bytes / 1000:.0f} kB"
 
 
 def write_json(path: Path, content: Any) -> None:

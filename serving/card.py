@@ -52,8 +52,8 @@ def card(controller: Controller) -> str:
     ]
     for title, name in (("set points", "sp"), ("process variables", "pv"), ("measured disturbances", "dv")):
         idle = " (this law does not take them)" * (name == "dv" and "dv" not in m.inputs)
-        lines += _signals(title + idle, m.signals(name))
-    lines += _signals("manipulated variables", m.mv)
+        lines += _signals(title + idle, m.signals(name), m.period_s)
+    lines += _signals("manipulated variables", m.mv, m.period_s)
     lines += _operate(m.operate if "operate" in m.inputs else (), m.period_s)
     outputs = ["mv"] + ["state_next"] * bool(m.n_state) + ["info"] * bool(m.info)
     lines += ["", f"inputs      {', '.join(m.inputs)}", f"outputs     {', '.join(outputs)}"]
@@ -73,7 +73,7 @@ def card_json(controller: Controller) -> str:
     return json.dumps({**json.loads(controller.manifest.to_json()), "file": file, "graph": versions}, indent=2)
 
 
-def _signals(title: str, signals: tuple[Signal, ...]) -> list[str]:
+def _signals(title: str, signals: tuple[Signal, ...], period_s: float) -> list[str]:
     if not signals:
         return []
     width = max(len(s.name) for s in signals)
@@ -81,7 +81,7 @@ def _signals(title: str, signals: tuple[Signal, ...]) -> list[str]:
     for s in signals:
         allowed = f"{s.low:g} .. {s.high:g}" if s.values is None else f"one of {', '.join(f'{v:g}' for v in s.values)}"
         unit = "" if s.unit == "-" else f" {s.unit}"
-        moves = "" if s.max_move is None else f", moves at most {s.max_move:g}{unit} a period"
+        moves = "" if s.max_move is None else f", moves at most {s.max_move:g}{unit} a period ({period_s:g} s)"
         rows.append(f"  {s.name:<{width}}  {allowed}{unit}{moves}")
     return ["", title, *rows]
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from math import inf, isnan, nan
+from math import nan
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.active_controller import ActiveController, Guards, LawInputs, Successor
 from loopwright.serving.clock import Clock, MonotonicClock
 from loopwright.serving.controller import Controller
-from loopwright.serving.endpoint import Endpoint, HandsBack
+from loopwright.serving.endpoint import Endpoint
 from loopwright.serving.errors import LoopError
-from loopwright.serving.guard import Guard, Sample, default_guards, reworded
+from loopwright.serving.guard import Guard, Sample, default_guards
+from loopwright.serving.in_charge.active_controller import ActiveController, Guards, LawInputs
+from loopwright.serving.in_charge.successor import Successor
 from loopwright.serving.modes import Command, Fallback, LoopMode, Mode, Transfer, mode_of
-from loopwright.serving.mv_readback import AppliedMV
+from loopwright.serving.mvs.commanded import CommandedMV
 from loopwright.serving.mvs.out_of_use import OutOfUse
 from loopwright.serving.preview.course import Courses, Points
 from loopwright.serving.ranges import within
@@ -34,21 +35,13 @@ WARM_LEAD_S = 4e-4  # within the clock's spin, so that the processor does not sl
 class ControlLoop:
     """One controller on one plant.
 
-    AUTO commands the law's MV. MANUAL commands the operator's MV; the law is still stepped with
-    the applied MV, so the transfer to AUTO is bumpless. HOLD keeps the last applied MV. SHADOW writes
-    nothing: the law is stepped on what others do with the plant. A fault in AUTO changes the mode to
-    HOLD, and the command names the reason; ``recover_after`` good samples change it back. A fault that
-    lasts is for ``fallback``. After a gap the law starts cold (state = 0). A law that reads ``fresh`` goes on without a
-    PV whose reading alone is bad; the command names it. One with ``use`` of an MV goes on without that MV, where an
-    operator has it in hand or the plant has it itself, see ``loopwright.serving.mvs``.
-
-    After a command that did not reach the plant (``unwritten``), HOLD, MANUAL and the fallback go on from where the MV
-    stands, see ``loopwright.serving.mv_readback.AppliedMV``.
-
-    Every written MV lies in its range, in every mode and with any guards; a discrete MV has one of its values. An MV
-    moves by at most its ``max_move`` a period: a law that gives more has a fault, the fallback and an operator's MV
-    (``set_mv``) go on scan by scan. A read-back may exceed the range by ``guard.READ_BACK_MARGIN`` times the range: it
-    is clipped to the range, for the law and for HOLD. A larger excess is a fault.
+    AUTO commands the law's MV. MANUAL commands the operator's MV; the law is still stepped with the applied MV, so the
+    transfer to AUTO is bumpless. HOLD keeps the last applied MV. SHADOW writes nothing: the law is stepped on what
+    others do with the plant. A fault in AUTO changes the mode to HOLD, and the command names the reason;
+    ``recover_after`` good samples change it back. A fault that lasts is for ``fallback``. After a gap the law starts
+    cold (state = 0). A law that reads ``fresh`` goes on without a PV whose reading alone is bad; the command names it.
+    One with ``use`` of an MV goes on without that MV, where an operator has it in hand or the plant has it itself, see
+    ``loopwright.serving.mvs``. Limits of all that is written are those of ``loopwright.serving.mvs.commanded``.
 
     Parameters
     ----------
@@ -112,12 +105,9 @@ class ControlLoop:
         local_s: float | None = None,
         learns: bool = True,
     ) -> None:
-        mode = mode_of(mode)
-        if recover_after is not None and recover_after < 1:
-            raise LoopError(f"recover_after is {recover_after}; it must be at least 1, or None")
-        if not 0 <= transfer_s < inf:
-            raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         manifest = controller.manifest
+        self._mode = LoopMode(mode, manifest.period_s, recover_after, fallback)
+        self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
         guards = default_guards if guards is None else guards
         self._active = ActiveController(controller, guards, bridge_s=bridge_s, critical=critical)
         self._out = OutOfUse(manifest.mv, manifest.period_s, local_s)
@@ -125,25 +115,17 @@ class ControlLoop:
             self.set_operate(operate)
         self.manifest = manifest  # of the first controller: its signals are what the loop reads, whoever is in charge
         self.endpoint = endpoint
-        self.recover_after = recover_after
         self.clock: Clock = clock or MonotonicClock()
         self.warm_lead_s = min(warm_lead_s, manifest.period_s / 4)
         self.max_gap, self.learns = max_gap, learns
-        self.fallback = fallback
         if fallback is not None:
-            fallback.check(manifest.mv)
-            if fallback.hand_back and not isinstance(endpoint, HandsBack | None):
-                raise LoopError(f"{type(endpoint).__name__} cannot hand the plant back: it has no method hand_back")
+            fallback.check(manifest.mv, endpoint)
         self._sp = within(sp, manifest.sp, "set point")
-        self._mv = np.full(len(manifest.mv), nan) if mv is None else within(mv, manifest.mv, "MV")
-        self._mode = LoopMode(mode)
+        stands = np.full(len(manifest.mv), nan) if mv is None else within(mv, manifest.mv, "MV")
+        self._mv = CommandedMV(manifest.mv, stands, self._out)
         self._refused_why = ""  # why the last sample was refused; empty after a good one, and before the first
-        self._scan = 0
-        self._applied = AppliedMV(manifest.mv, self._mv)
-        self.found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
-        self._transfer = Transfer(manifest.mv, manifest.period_s, transfer_s)
+        self._scan = 0  # that comes next
         self._transfer.begin()
-        self._stood: Array | None = None  # shape: (n_mv,), the same, and where others had moved it until now
 
     # ------------------------------------------------------------------ who is in charge
     @property
@@ -197,12 +179,17 @@ class ControlLoop:
     @property
     def mv(self) -> Array:
         """Last commanded MV, shape (n_mv,); NaN while it is not known where the MV stands."""
-        return self._mv.copy()
+        return self._mv.now.copy()
+
+    @property
+    def found(self) -> Array | None:
+        """Where the MV stands (n_mv,), at the scan that learns it after a command that did not reach the plant."""
+        return self._mv.found
 
     @property
     def mv_wanted(self) -> Array:
         """Where the MV goes by hand, shape (n_mv,); the last commanded one where it is there."""
-        return self._out.hand.goal(self._mv)
+        return self._mv.goal
 
     @property
     def local(self) -> dict[str, str]:
@@ -220,13 +207,11 @@ class ControlLoop:
         LoopError for another word, and where a shadow that has no good sample now is to move the plant.
         """
         mode = mode_of(mode)
-        if self.mode is Mode.SHADOW and mode is not Mode.SHADOW and self._refused_why:
-            why = f"the last sample was refused ({self._refused_why})"
-            raise LoopError(f"{why}: where the MV stands is not known; wait")
+        if self.mode is Mode.SHADOW and mode is not Mode.SHADOW and (why := self._refused_why):
+            raise LoopError(f"the last sample was refused ({why}): where the MV stands is not known; wait")
         if mode is not self.mode:
             self._transfer.begin()
-            self._out.begun(mode, self._active.in_hand)
-            self._applied.take(mode is not Mode.SHADOW and (self._applied.taken or self.mode is Mode.SHADOW))
+            self._mv.begun(mode, self.mode, self._active.in_hand)
         self._mode.set(mode)
 
     def set_sp(self, sp: ArrayLike) -> tuple[str, ...]:
@@ -243,9 +228,8 @@ class ControlLoop:
     def set_course(self, points: Mapping[str, Points], straight: Collection[str] = (), who: str = "") -> None:
         """Give known set points and forecasts of measured disturbances, by name, as points (time [s], value).
 
-        Times count from the next scan on. Set points and the law follow them in every mode, see ``Courses``; ``set_sp``
-        ends the course of a set point. ``who`` gave it is kept beside it. LoopError for a law that does not read
-        ``ahead``, and for points that cannot be; then nothing is changed.
+        Times count from the next scan on, see ``Courses``; ``who`` is who gave it. LoopError for a law that does not
+        read ``ahead``, and for points that cannot be; then nothing is changed.
         """
         self.require_course(points, straight)
         self.courses.give(points, straight, who)
@@ -287,15 +271,12 @@ class ControlLoop:
         """
         signals = self.controller.manifest.mv
         wanted = within(mv, signals, "MV")
-        self.require_in_hand({*self._out.others(self._mv, wanted), *take}, take)
-        if self._applied.lost:
-            raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
+        self.require_in_hand({*self._out.others(self._mv.now, wanted), *take}, take)
+        self._mv.require_arrived()
         taken = np.array([s.name in take for s in signals]) & ~self._active.in_hand
         if taken.any():
             self.set_operate({f"{s.name}.use": 0.0 for s, of in zip(signals, taken.tolist(), strict=True) if of})
-        self._mv = self._out.hand.sent(self._mv, wanted, signals, taken)
-        on_its_way = self._out.hand.wanted is not None
-        self._applied.take(self._applied.taken and on_its_way)  # else the MV is where it was sent
+        self._mv.send(wanted, signals, taken)
 
     def require_in_hand(self, names: Collection[str], take: Collection[str] = ()) -> None:
         """LoopError unless operators have these MVs in hand: all in MANUAL, those of ``use`` 0 in AUTO and HOLD.
@@ -312,94 +293,65 @@ class ControlLoop:
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         self._sp = self.courses.followed(self._sp, self.controller.manifest.sp)
-        sample = self._out.look(sample, self._active.mv_entries, lost=self._applied.lost)
+        sample = self._out.look(sample, self._active.mv_entries, lost=self._mv.lost)
         readings = self._active.look(sample, self._out.local.why)
         reason, self._refused_why = readings.reason, ""
-        self._applied.arrived()
-        taken = self._applied.taken
-        shown = self._applied.look(sample, self._mv, refused=bool(reason), theirs=self._out.local.away)
-        self.found = self._stood = shown.found
-        blind = self._out.hand.wanted is not None and isnan(self._mv[0])  # on a way by hand from nobody knows where
-        if shown.applied is not None and (taken or blind):
-            self._mv = self._stood = shown.applied.copy()
+        shown = self._mv.look(sample, reason, self.mode, self._active.in_hand)
         if shown.silent:
-            if shown.outside:
-                self._mv = np.full(len(self._mv), nan)
-            doubled = not reason or shown.silent.startswith(reason)
-            both = shown.silent if doubled else reworded(reason, f"{reason}; {shown.silent}")
-            return self._without_sample(both, silent=True)
-        if self.found is not None:
-            self._mv, self._out.hand.wanted = self.found.copy(), None
-        self._mv = self._out.follow(self._mv, shown.applied, self._applied, self.mode, self._active.in_hand)
+            return self._without_sample(shown.silent, silent=True)
         if reason:
             return self._without_sample(reason)
-        applied = self._mv if shown.applied is None else shown.applied
-        if shown.applied is None and isnan(self._mv[0]):
-            applied = self._mv = self.mv_wanted  # nobody but the operator says where it stands
+        applied = self._mv.begins(shown.applied)
         try:
-            if shown.applied is None:
-                applied = self._applied.read_back(sample, self._mv)
-            if isnan(self._mv[0]):
-                self._mv = applied.copy()
-            self._mv = self._out.hand.toward(self._mv, self.controller.manifest.mv)
-            held = None if self.mode is Mode.SHADOW else self._mv
+            applied = self._mv.read_back(sample, shown.applied)
+            self._mv.move_by_hand(self.controller.manifest.mv)
+            held = None if self.mode is Mode.SHADOW else self._mv.now
             step = self._active.step(readings, self._sp, applied, self._out.those, held)
         except Exception as error:  # the plant needs an MV after any error
             if self.mode in {Mode.AUTO, Mode.SHADOW}:
-                self._mv = self._out.without(self._mv, applied)
+                self._mv.now = self._out.without(self._mv.now, applied)
             return self._without_sample(first_line(error), by_hand=False)
         # Once it was asked, the plant's own controller may have the plant already.
-        if self.fault and not self._handing_back() and self._mode.recovers(self.recover_after):
+        if self.fault and not self._mode.handing_back and self._mode.recovers():
             self._transfer.begin()  # nobody has said that an MV which is elsewhere follows its commands again
             self._mode.set(Mode.AUTO)
         if self.mode is Mode.AUTO:
-            self._mv = self._out.without(self._mv, self._transfer.limited(step.mv, applied))
+            self._mv.now = self._out.without(self._mv.now, self._transfer.limited(step.mv, applied))
         elif self.mode is Mode.SHADOW:
-            self._mv = applied.copy()
-        try:
-            if self.learns:
-                self._active.learn(self._mv)
-        except Exception as error:  # the MV of this scan is known; the next one begins without a past
-            self._active.begin_cold(first_line(error))
+            self._mv.now = applied.copy()
+        if self.learns:
+            self._active.learn(self._mv.now)
         before = self.controller
         beside = self._active.beside(readings.sample, self._sp, applied, self._out.local.away, held, self._out.those)
         if self.controller is not before:
             self._transfer.begin()
-        self._lasting()
+        self._mv.fall_back(self._mode, self.controller.manifest.mv)
         command = self._command(step.mv, step.info, self.fault, beside)
         good = not (readings.bridged or readings.shed)
         return command if good else replace(command, bridged=readings.bridged, shed=readings.shed)
 
     def miss(self, reason: str) -> Command:
         """The command for a scan without a usable sample: the MV stays, and the law starts cold at the next."""
-        self._applied.arrived()
-        self.found = self._stood = None
         self._sp = self.courses.followed(self._sp, self.controller.manifest.sp)
         self._active.missed(1)
-        silent = self._applied.untold()
-        if silent:
-            return self._without_sample(f"{reason}; {silent}", silent=True)
-        self._mv = self._out.follow(self._mv, None, self._applied, self.mode, self._active.in_hand)
-        return self._without_sample(reason)
+        silent = self._mv.unread(self.mode, self._active.in_hand)
+        return self._without_sample(f"{reason}; {silent}" if silent else reason, silent=bool(silent))
 
     def _without_sample(self, reason: str, *, silent: bool = False, by_hand: bool = True) -> Command:
         self._refused_why = reason = reason or "a fault without a reason"
         self._lose(reason)
         if by_hand and not silent:
-            self._mv = self._out.hand.toward(self._mv, self.controller.manifest.mv)
-        self._lasting(moves=not silent)
+            self._mv.move_by_hand(self.controller.manifest.mv)
+        self._mv.fall_back(self._mode, self.controller.manifest.mv, moves=not silent)
         command = self._command(None, None, reason)
-        return replace(command, mv=np.full(len(self._mv), nan)) if silent else command
+        return replace(command, mv=np.full(len(self._mv.now), nan)) if silent else command
 
     def unwritten(self, before: Array, reason: str) -> Command:
         """The command in place of the last one, which never reached the plant: the MV ``before`` it (n_mv,) stays.
 
         Where the scan has found that the MV stands elsewhere, it stays there.
         """
-        stands = np.array(before if self._stood is None else self._stood, dtype=np.float64)
-        by_hand = self.mode is Mode.MANUAL and self._out.hand.wanted is None  # where it should be is where it goes
-        self._mv = self._out.hand.sent(stands, self._mv, self.controller.manifest.mv) if by_hand else stands
-        self._applied.lose()
+        self._mv.unwritten(before, self.mode, self.controller.manifest.mv)
         self._lose(reason)
         self._scan -= 1
         self.courses.passed(-1)  # this scan is counted already
@@ -418,24 +370,13 @@ class ControlLoop:
         self._active.forget(reason)
         self._mode.lose(reason)
 
-    def _lasting(self, *, moves: bool = True) -> None:
-        """Count the scans of a fault, and go where the fallback says once it has lasted."""
-        self._mode.hold()
-        if moves and self.fallback is not None and self._mode.overdue(self.fallback, self.manifest.period_s):
-            safe = self.fallback.toward(self._mv, self.controller.manifest.mv, self.manifest.period_s)
-            self._mv = self._out.without(self._mv, safe)
-
-    def _handing_back(self) -> bool:
-        return self._mode.handing_back(self.fallback, self.manifest.period_s)
-
     def _command(self, law_mv: Array | None, info: Array | None, reason: str, beside: Array | None = None) -> Command:
         self._scan += 1
         self.courses.over()
         self.courses.passed(1)
-        back, sp, mv = self._handing_back(), self._sp.copy(), self._mv.copy()
+        back, sp, mv = self._mode.handing_back, self._sp.copy(), self.mv
         command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back, local=self.local)
-        self._applied.command(self._mv, written=command.writes)
-        self._out.local.commanded(self._mv, written=command.writes)
+        self._mv.given(written=command.writes)
         return command
 
     # ------------------------------------------------------------------ running
@@ -452,13 +393,7 @@ class ControlLoop:
 
         ``before(k)`` is called before the scan at grid place k (for a schedule of set points), ``observe`` after it.
         ``loopwright.serving.scan_grid.run_on_grid`` says what happens where one of them, or the endpoint, raises.
-
-        Raises
-        ------
-        LoopError
-            There is no endpoint.
-        Exception
-            The clock failed at its first reading; no MV was commanded yet.
+        LoopError without an endpoint; what the clock raises at its first reading, before any MV was commanded.
         """
         if self.endpoint is None:
             raise LoopError("run needs an endpoint; without one call scan with your own samples")

@@ -11,6 +11,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.serving.endpoint import Endpoint, HandsBack
 from loopwright.serving.errors import LoopError
 from loopwright.serving.manifest import Signal
 from loopwright.serving.ranges import within
@@ -48,8 +49,10 @@ class Fallback:
         if self.rate is not None and not all(r > 0 for r in self.rate):
             raise LoopError(f"rate is {self.rate}; each must be above zero")
 
-    def check(self, signals: Sequence[Signal]) -> None:
-        """LoopError where the safe MV is none of these MVs, or the rates are not as many."""
+    def check(self, signals: Sequence[Signal], endpoint: Endpoint | None = None) -> None:
+        """LoopError where the safe MV is none of these MVs, the rates are too few, or ``endpoint`` cannot hand back."""
+        if self.hand_back and not isinstance(endpoint, HandsBack | None):
+            raise LoopError(f"{type(endpoint).__name__} cannot hand the plant back: it has no method hand_back")
         if self.mv is None or self.rate is None:
             return
         within(self.mv, signals, "safe MV")
@@ -99,12 +102,18 @@ def mode_of(mode: Mode | str) -> Mode:
 class LoopMode:
     """The mode of a loop now, and the fault that changed it to HOLD.
 
-    Somebody sets the mode, or a scan in AUTO without an MV of the law is a fault: HOLD. So many good samples change it
-    back. A fault that lasts is for the fallback.
+    Somebody sets the mode, or a scan in AUTO without an MV of the law is a fault: HOLD. ``recover_after`` good samples
+    change it back; None: only an operator does. A fault that lasts is for the ``fallback``. ``period_s`` [s] is the
+    loop's. LoopError for a mode that is none, and for ``recover_after`` below 1.
     """
 
-    def __init__(self, mode: Mode) -> None:
-        self.set(mode)
+    def __init__(
+        self, mode: Mode, period_s: float, recover_after: int | None = None, fallback: Fallback | None = None
+    ) -> None:
+        self.set(mode_of(mode))
+        if recover_after is not None and recover_after < 1:
+            raise LoopError(f"recover_after is {recover_after}; it must be at least 1, or None")
+        self._period_s, self._recover_after, self._fallback = period_s, recover_after, fallback
 
     def set(self, mode: Mode) -> None:
         """Somebody sets the mode: a fault is over."""
@@ -118,24 +127,30 @@ class LoopMode:
         if self.now is Mode.AUTO or self.fault:
             self.now, self.fault = Mode.HOLD, reason
 
-    def recovers(self, after: int | None) -> bool:
-        """A good sample during a fault: whether it is the last of the ``after`` that lead back to AUTO; None: none."""
+    def recovers(self) -> bool:
+        """A good sample during a fault: whether it is the last of those that lead back to AUTO."""
         self._good += 1
-        return after is not None and self._good >= after
+        return self._recover_after is not None and self._good >= self._recover_after
 
     def hold(self) -> None:
         """Count a scan of a fault."""
         self._held += bool(self.fault)
 
-    def overdue(self, fallback: Fallback | None, period_s: float) -> bool:
-        """Whether a fault has lasted so long that ``fallback`` is due."""
-        if not self.fault or fallback is None:
+    @property
+    def overdue(self) -> bool:
+        """Whether a fault has lasted so long that the fallback is due."""
+        if not self.fault or self._fallback is None:
             return False
-        return (self._held - 1) * period_s >= fallback.after_s
+        return (self._held - 1) * self._period_s >= self._fallback.after_s
 
-    def handing_back(self, fallback: Fallback | None, period_s: float) -> bool:
+    @property
+    def handing_back(self) -> bool:
         """Whether the plant is to be given to its own controller."""
-        return fallback is not None and fallback.hand_back and self.overdue(fallback, period_s)
+        return self._fallback is not None and self._fallback.hand_back and self.overdue
+
+    def safe(self, mv: Array, signals: Sequence[Signal]) -> Array:
+        """The MV (n_mv,) one period nearer to where the fallback goes; as it is without one."""
+        return mv if self._fallback is None else self._fallback.toward(mv, signals, self._period_s)
 
 
 # ------------------------------------------------------------------------------------------------ the result of a scan
@@ -180,10 +195,12 @@ class Transfer:
 
     It ends once each MV is where the law wants it, at the latest after ``transfer_s``. A discrete MV has no way
     between its values and is not limited. A law that adds to the applied MV needs none of this; one that computes its
-    MV afresh would bump the plant by whatever its model is wrong.
+    MV afresh would bump the plant by whatever its model is wrong. LoopError for a time that cannot be.
     """
 
     def __init__(self, mv: Sequence[Signal], period_s: float, transfer_s: float) -> None:
+        if not 0 <= transfer_s < inf:
+            raise LoopError(f"transfer_s is {transfer_s}; it must be a finite number of seconds, 0 or more")
         self._scans = int(np.ceil(transfer_s / period_s))
         share = 1.0 if self._scans == 0 else period_s / transfer_s
         self._most = np.array([np.inf if s.values is not None else share * (s.high - s.low) for s in mv])

@@ -13,8 +13,8 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 from loopwright.serving import controller
-from loopwright.serving.active_controller import AdaptedController
 from loopwright.serving.errors import ArtifactError, NotProvenError
+from loopwright.serving.in_charge.adapted import AdaptedController
 from loopwright.serving.manifest import Manifest
 
 if TYPE_CHECKING:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from loopwright.pipeline.errors import HostError
 from loopwright.pipeline.export.plain_code.c_files import c_folder, c_name, require_c_name
-from loopwright.pipeline.files import draft_folder_of, write_text
+from loopwright.pipeline.files import require_new_folder, write_text_folder
 from loopwright.serving.controller import Controller
 
 
@@ -22,13 +21,8 @@ def options(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Write the folder, unless its statements part from the controller."""
     out: Path = options.out
-    if out.exists():
-        raise HostError(f"{out} is there already; remove it, or name another folder")
+    require_new_folder(out)
     controller = Controller(options.file)
     name = c_name(controller.manifest) if options.name is None else require_c_name(options.name)
     files = c_folder(controller, name)
-    with draft_folder_of(out) as draft:
-        for file, text in files.items():
-            write_text(draft / file, text)
-    size = sum(len(text.encode()) for text in files.values()) / 1000
-    print(f"{out}: {', '.join(files)}, {size:.0f} kB; make -C {out} check runs the self-test")
+    print(f"{out}: {write_text_folder(out, files)}; make -C {out} check runs the self-test")

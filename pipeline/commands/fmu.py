@@ -8,14 +8,12 @@ import tempfile
 from pathlib import Path
 
 from loopwright.pipeline.errors import ExportError, HostError
-from loopwright.pipeline.files import draft_of
+from loopwright.pipeline.files import draft_of, size_words
 from loopwright.pipeline.hosts.fmu.compiling import toolchain
 from loopwright.pipeline.hosts.fmu.folder import check, pack, problems, write_folder
 from loopwright.pipeline.hosts.fmu.law_sources import plain_answers
 from loopwright.serving.conformance.steps import StepResult, answered
 from loopwright.serving.controller import Controller
-
-KILOBYTE = 1e3  # bytes
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -46,8 +44,8 @@ def run(options: argparse.Namespace) -> None:
         if wrong:
             raise HostError(f"the FMU's description is not valid FMI {options.fmi}.0: {'; '.join(wrong)}")
         steps = check(controller, draft, folder, answered(controller) if plain is None else plain)
-    size, of = out.stat().st_size / KILOBYTE, "controller file" if plain is None else "plain C's statements"
-    print(f"{out}: FMI {options.fmi}.0, {size:.0f} kB, {steps} steps give the same bits as the {of}")
+    size, of = size_words(out.stat().st_size), "controller file" if plain is None else "plain C's statements"
+    print(f"{out}: FMI {options.fmi}.0, {size}, {steps} steps give the same bits as the {of}")
 
 
 def _plain_answers(controller: Controller) -> list[StepResult]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from math import ceil
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, cast
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from loopwright.serving.controller import Controller, session_of
 from loopwright.serving.controller_file import read_controller
-from loopwright.serving.errors import ArtifactError, ContractError, OutputError
+from loopwright.serving.errors import ArtifactError, ContractError, LoopError, OutputError
 from loopwright.serving.explain.explain_file import controller_path, explain_manifest
 from loopwright.serving.explain.explanation import (
     Cause,
@@ -26,13 +27,16 @@ from loopwright.serving.explain.explanation import (
 from loopwright.serving.fields import nearest, shown
 from loopwright.serving.graph.audit import audit
 from loopwright.serving.operating import Operate
+from loopwright.serving.preview.course import Courses, Points
 from loopwright.serving.ranges import numbers, within
 
 Array: TypeAlias = NDArray[np.float64]
 NO_PART = 1e-13  # of an MV's range: a smaller part is none
+AT_LIMIT = 1e-6  # of an MV's range: nearer to a limit is at it
 # Share of an MV's range by which both graphs may differ and be one law. They round apart, and where the plan hardly
 # bends rounding grows: on a served tank with three valves for two variables by more than 1e-9.
 SAME_MV = 1e-6
+MOST_SAMPLES = 500  # of a what-if: each takes 1 ms or so, with the change and without it
 
 
 class Explainer:
@@ -106,16 +110,31 @@ class Explainer:
         operate: ArrayLike | None = None,
         fresh: ArrayLike | None = None,
         ahead: ArrayLike | None = None,
+        course: Mapping[str, Points] | None = None,
+        straight: Collection[str] = (),
+        ended: Collection[str] = (),
     ) -> WhatIf:
         """The courses that the law would make after ``changes``, beside what it does without them; nothing is set.
 
-        ``changes`` name set points by their signals, and entries of ``operate`` as these are named. The courses are
-        those of the closed loop over the law's own model: the law plans anew at every sample, disturbances stay.
+        ``changes`` name set points by their signals, and entries of ``operate`` as these are named. ``course`` and
+        ``straight`` are as of ``ControlLoop.set_course``: points (time [s] from this step, value) of set points and
+        measured disturbances, by name, in place of what ``ahead`` has of them. Nothing is to come of those in
+        ``ended``. ``ahead`` (K n,) may know more than the N samples of the law's horizon: the law then reads them as
+        they come near; the last ones stay.
+
+        The courses are those of the closed loop over the law's own model: the law plans anew at every sample, and
+        disturbances do what is forecast, else they stay. They have N samples; with a ``course`` N more than until its
+        last point, ``MOST_SAMPLES`` at most.
+
         ContractError for an unknown name, LoopError for a set point and ContractError for another value that is not
-        allowed; else as ``step``.
+        allowed, LoopError as ``set_course`` for a course; else as ``step``.
         """
-        given = _Given(sp, pv, mv_applied, state, dv, operate, fresh, ahead)
-        return WhatIf(dict(changes), self._run(given), self._run(self._changed(given, changes)))
+        given = self._known(_Given(sp, pv, mv_applied, state, dv, operate, fresh, ahead))
+        changed, samples = self._changed(given, changes), self.explains.horizon
+        if course or straight or ended:
+            self._looked(self._later(given, 0))  # wrong inputs are refused before a course is made of them
+            changed, samples = self._with_courses(changed, course or {}, straight, ended)
+        return WhatIf(dict(changes), self._run(given, samples), self._run(changed, samples))
 
     def changed_inputs(
         self, changes: Mapping[str, float], sp: ArrayLike, operate: ArrayLike | None = None
@@ -143,11 +162,57 @@ class Explainer:
 
     def _changed(self, given: _Given, changes: Mapping[str, float]) -> _Given:
         sp, operate = self.changed_inputs(changes, given.sp, given.operate)
+        return self._ended(given._replace(sp=sp, operate=operate), changes)  # a set point ends its course
+
+    def _ended(self, given: _Given, names: Collection[str]) -> _Given:
+        """``given`` without what is to come of some signals."""
         if given.ahead is None or self.manifest.ahead is None:
-            return given._replace(sp=sp, operate=operate)
-        later = np.array(given.ahead, dtype=np.float64).reshape(self.manifest.ahead.horizon, -1)
-        later[:, [i for i, s in enumerate(self.manifest.sp) if s.name in changes]] = 0.0  # it ends their courses
-        return given._replace(sp=sp, operate=operate, ahead=later.ravel())
+            return given
+        later = np.array(given.ahead)
+        later[:, [i for i, s in enumerate(self.manifest.ahead.signals) if s.signal in names]] = 0.0
+        return given._replace(ahead=later)
+
+    def _known(self, given: _Given) -> _Given:
+        """``given`` with what is known ahead as an array (K, n); ContractError where that is not of whole samples."""
+        known = self.manifest.ahead
+        if given.ahead is None or known is None:
+            return given
+        n = len(known.signals)
+        try:
+            rows = np.array(numbers(given.ahead), dtype=np.float64)
+        except TypeError as error:
+            raise ContractError(f"ahead {error}; it needs {n} numbers a sample") from error
+        if rows.ndim != 1 or rows.size % n or rows.size < known.size:
+            raise ContractError(
+                f"ahead has the shape {rows.shape}; what-if needs {n} numbers a sample, and {known.horizon} samples or "
+                "more"
+            )
+        return given._replace(ahead=rows.reshape(-1, n))
+
+    def _with_courses(
+        self, given: _Given, points: Mapping[str, Points], straight: Collection[str], ended: Collection[str]
+    ) -> tuple[_Given, int]:
+        """``given`` with some courses to come and without those ``ended``; and how many samples there are to see."""
+        m, known, horizon = self.manifest, self.manifest.ahead, self.explains.horizon
+        if known is None:
+            raise LoopError(f"{m.law} has no ahead: it cannot be given a course; design it with `preview: course`")
+        given = self._ended(given, ended)
+        if not points and not straight:
+            return given, horizon
+        courses = Courses(m)
+        courses.give(points, straight)
+        last = max(of.times_s[-1] for of in courses.standing.values())
+        samples = min(max(horizon, ceil(last / m.period_s) + horizon), max(horizon, MOST_SAMPLES))
+        sp = courses.followed(np.array(given.sp, dtype=np.float64, ndmin=1), m.sp)
+        rows = courses.ahead(m, sp, given.dv, samples + known.horizon)
+        later = np.zeros((samples + known.horizon, len(known.signals)))
+        if given.ahead is not None:
+            stands = np.asarray(given.ahead)[: len(later)]
+            later[:] = np.vstack([stands, np.repeat(stands[-1:], len(later) - len(stands), axis=0)])
+        if rows is not None:
+            of = [i for i, s in enumerate(known.signals) if s.signal in points]
+            later[:, of] = rows.reshape(later.shape)[:, of]
+        return given._replace(sp=sp, ahead=later), samples
 
     # ------------------------------------------------------------------ the graph
     def _looked(self, given: _Given) -> dict[str, Array]:
@@ -197,47 +262,69 @@ class Explainer:
         rests = {e.signal: v for e, v in zip(m.operate, operate, strict=True) if (e.group, e.what) == ("mv", "rest")}
         applied = np.array(given.mv_applied, dtype=np.float64, ndmin=1).tolist()
         to_rest = {s.name: rests[s.name] - at for s, at in zip(m.mv, applied, strict=True) if s.name in rests}
-        rows = found["parts"].reshape(len(m.mv), len(causes))
+        rows, later = found["parts"].reshape(len(m.mv), len(causes)), self._limits_reached(found, operate, applied)
         moves = []
         for s, move, row in zip(m.mv, found["move"].tolist(), rows.tolist(), strict=True):
             span = s.high - s.low
-            parts = [MovePart(cast("Cause", c), n, v) for (c, n), v in zip(causes, row, strict=True)]
+            parts = [
+                MovePart(cast("Cause", c), n, v, later.get((c, n), 0.0)) for (c, n), v in zip(causes, row, strict=True)
+            ]
             parts = sorted((p for p in parts if abs(p.value) > NO_PART * span), key=lambda p: -abs(p.value))
             parts = parts or [MovePart("not_in_use", s.name, move) if s.name in idle else MovePart("plan", "", move)]
             words = sentence_of(move, span, parts, news, {s.name: to_rest.get(s.name, 0.0)})
             moves.append(ExplainedMove(s.name, s.unit, move, tuple(parts), words))
         return tuple(moves)
 
-    def _run(self, given: _Given) -> Explanation:
-        """The closed loop over the law's model from here: moves of the first step, courses of all."""
-        n, outputs, period_s = self.explains.horizon, self.explains.outputs, self.manifest.period_s
-        at_first, first = given, self._looked(given)
-        found = first
+    def _limits_reached(
+        self, found: Mapping[str, Array], operate: Array, applied: list[float]
+    ) -> dict[tuple[str, str], float]:
+        """Time [s] until each MV is at a limit by its plan, by cause and signal; 0 where it is now, or next."""
+        m, reached = self.manifest, dict[tuple[str, str], float]()
+        z = found["z"].reshape(len(self.explains.starts), len(m.mv)).copy()
+        z[0] = found["mv"]  # within the limits, where the plan is so up to rounding
+        set_ends: dict[tuple[str, str], float] = {
+            (e.signal, e.what): v for e, v in zip(m.operate, operate.tolist(), strict=True) if e.group == "mv"
+        }
+        for i, s in enumerate(m.mv):
+            course, slack = np.array([applied[i], *z[:, i]]), AT_LIMIT * (s.high - s.low)
+            high, low = (set_ends.get((s.name, end), own) for end, own in (("high", s.high), ("low", s.low)))
+            for cause, room in (("mv_high", min(high, s.high) - course), ("mv_low", course - max(low, s.low))):
+                place = int(np.argmin(np.maximum(room, slack)))  # the first one at the limit, else the nearest
+                reached[cause, s.name] = m.period_s * self.explains.starts[max(0, place - 1)]
+        return reached
+
+    def _run(self, given: _Given, samples: int) -> Explanation:
+        """The closed loop over the law's model from here: moves of the first step, courses of so many samples."""
+        outputs, period_s = self.explains.outputs, self.manifest.period_s
+        at_first = self._later(given, 0)
+        first = found = self._looked(at_first)
         ys, mvs = [found["y"][:outputs]], [found["mv"]]
         pv = np.array(given.pv, dtype=np.float64, ndmin=1)
-        for _ in range(n - 1):
+        for k in range(1, samples):
             pv[:outputs] = ys[-1]
-            given = self._later(given)
-            found = self._looked(given._replace(pv=pv, mv_applied=mvs[-1], state=found["state_next"], fresh=None))
+            then = self._later(given, k)
+            found = self._looked(then._replace(pv=pv, mv_applied=mvs[-1], state=found["state_next"], fresh=None))
             ys.append(found["y"][:outputs])
             mvs.append(found["mv"])
-        ahead, starts = (tuple(period_s * (k + i) for k in range(n)) for i in (1, 0))
+        ahead, starts = (tuple(period_s * (k + i) for k in range(samples)) for i in (1, 0))
         courses = self._courses(ahead, np.array(ys), starts, np.array(mvs))
         return Explanation(period_s, courses, self._moves(first, at_first))
 
-    def _later(self, given: _Given) -> _Given:
-        """The inputs a sample on, of what is known to come: the last known values stay."""
+    def _later(self, given: _Given, k: int) -> _Given:
+        """The inputs k samples on, of what is known to come (K, n): the last known values stay."""
         known = self.manifest.ahead
         if given.ahead is None or known is None:
             return given
-        n_sp, rows = len(self.manifest.sp), np.asarray(given.ahead, dtype=np.float64).reshape(known.horizon, -1)
-        sp = np.array(given.sp, dtype=np.float64, ndmin=1) + rows[0, :n_sp]
-        dv = None if given.dv is None else np.array(given.dv, dtype=np.float64, ndmin=1) + rows[0, n_sp:]
-        return given._replace(sp=sp, dv=dv, ahead=(np.vstack([rows[1:], rows[-1:]]) - rows[0]).ravel())
+        n_sp, rows = len(self.manifest.sp), np.asarray(given.ahead)
+        now = rows[min(k, len(rows)) - 1] if k else np.zeros(rows.shape[1])
+        sp = np.array(given.sp, dtype=np.float64, ndmin=1) + now[:n_sp]
+        dv = None if given.dv is None else np.array(given.dv, dtype=np.float64, ndmin=1) + now[n_sp:]
+        at = np.minimum(k + np.arange(known.horizon), len(rows) - 1)
+        return given._replace(sp=sp, dv=dv, ahead=(rows[at] - now).ravel())
 
 
 class _Given(NamedTuple):
-    """Inputs of a step, as a host gives them."""
+    """Inputs of a step, as a host gives them; of a what-if ``ahead`` is an array (K, n)."""
 
     sp: ArrayLike
     pv: ArrayLike

@@ -37,13 +37,15 @@ class MovePart:
     ``setpoint``: a CV is predicted off its set point while the MVs stand still. ``range_low`` and ``range_high``: an
     end of a CV's range. ``disturbance``: a measured disturbance changed since the last step. ``load``: a reading
     of a CV is not the predicted one, so that something not measured acts. ``cost`` of a CV or an MV, ``rest``: of an
-    MV to its resting value. ``mv_low`` and ``mv_high``: an MV is at a limit, ``max_move``: it moves no faster;
-    ``not_in_use``: it must stay. ``plan``: the rest, by which the plan still hangs on the last one.
+    MV to its resting value. ``mv_low`` and ``mv_high``: an MV is at a limit, now or ``in_s`` later, where only a later
+    move of the plan gets there. ``max_move``: it moves no faster; ``not_in_use``: it must stay. ``plan``: the rest, by
+    which the plan still hangs on the last one.
     """
 
     cause: Cause
     signal: str  # empty for ``plan``
     value: float  # [mv]
+    in_s: float = 0.0  # [s] until the MV is at its limit, by the plan; 0 where it is now or after the next move
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,7 @@ class Explanation:
                 "mv": m.mv,
                 "unit": m.unit,
                 "move": m.move,
-                "parts": [{"cause": p.cause, "signal": p.signal, "value": p.value} for p in m.parts],
+                "parts": [{"cause": p.cause, "signal": p.signal, "value": p.value, "in_s": p.in_s} for p in m.parts],
                 "sentence": m.sentence,
             }
             for m in self.moves
@@ -144,7 +146,8 @@ def sentence_of(
 
     ``news`` by the name of a signal: by how much a measured disturbance changed, or a reading is above the
     predicted one. ``to_rest`` by the name of the MV itself: how far its resting value is above where it stands. The
-    plan may go to that in a roundabout way, and its part of the first move points away from it; the words say so.
+    plan may go to that in a roundabout way, and its part of the first move points away from it; the words say so. A
+    move towards the resting value is never said to be held back by it.
     """
     way = {} if to_rest is None else to_rest
     away = {p.signal for p in parts if p.cause == "rest" and p.value * way.get(p.signal, 0.0) < 0}
@@ -160,6 +163,7 @@ def sentence_of(
     ahead, back = (
         [p for p in parts if (p.value * move > 0) is same and abs(p.value) > least] for same in (True, False)
     )
+    back = [p for p in back if p.cause != "rest" or move * way.get(p.signal, 0.0) <= 0]
     least = LEAST_SHARE * max(_sum(ahead), _sum(back))
     return "; held back by ".join(_listed(side, names) for side in (ahead, back) if side and _sum(side) >= least)
 
@@ -188,9 +192,17 @@ def words(part: MovePart, news: Mapping[str, float], *, roundabout: bool = False
         "load": f"something not measured {'raises' if up else 'lowers'} {name}",
         "cost": f"cost of {name}",
         "rest": f"{name} to its resting value{', first the other way' if roundabout else ''}",
-        "mv_low": f"{name} at its low limit",
-        "mv_high": f"{name} at its high limit",
+        "mv_low": f"{name} {_at('low', part.in_s)}",
+        "mv_high": f"{name} {_at('high', part.in_s)}",
         "max_move": f"{name} moves no faster",
         "not_in_use": f"{name} is not in use",
         "plan": "what was planned before",
     }[part.cause]
+
+
+def _at(end: str, in_s: float) -> str:
+    """An MV at one of its limits, or when it will be."""
+    if not in_s:
+        return f"at its {end} limit"
+    of, unit = next((size, name) for size, name in ((3600, "h"), (60, "min"), (0, "s")) if in_s >= size)
+    return f"will reach its {end} limit in {in_s / (of or 1):.3g} {unit}"

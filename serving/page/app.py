@@ -20,10 +20,10 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
-from loopwright.serving.active_controller import require_fits
 from loopwright.serving.controller_file import controller_files, file_digest, unseal
 from loopwright.serving.errors import ArtifactError, LoopError, LoopwrightError
 from loopwright.serving.graph.audit import MAX_GRAPH_BYTES, audit
+from loopwright.serving.in_charge.adapted import require_fits
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.manifest import MANIFEST_KEY, Manifest
 from loopwright.serving.monitor.weekly_report import plain_rows, week_reports
@@ -85,7 +85,13 @@ LONGEST_SPAN_S = 400 * 86_400.0  # [s] of a trend that a browser may ask for
 TELL_S = 60.0  # between two lines about wrong tokens
 TRENDS, WAITING_TRENDS = 2, 10  # that are computed at a time, and that may wait for it
 WAITING_LOOKS = 10  # changes that are looked at beforehand, one after the other: each takes up to a second of a core
+LOOKS = frozenset({"state", "about", "inputs", "future", "courses", "picture"})  # at the loop, which change nothing
 TRENDS_LATER_S = 2  # after which a trend beyond them may be asked for again
+
+
+WHAT_IF = (
+    'a what-if is {"changes": {the name of a set point or entry: a number}}, or {"course": as a loop is given one}'
+)
 
 
 class PageApp:
@@ -99,7 +105,7 @@ class PageApp:
         self._courses = Shared(lambda: self._asked({"do": "courses"}))
         self._told = -math.inf
         self._trends, self._waiting = asyncio.Semaphore(TRENDS), 0
-        self._foresight = LawForesight(lambda: ask({"do": "inputs"}))
+        self._foresight = LawForesight(ask)
         self._explained = Shared(lambda: asyncio.to_thread(self._foresight.explained))
         self._looks, self._looking = asyncio.Semaphore(1), 0
 
@@ -228,7 +234,7 @@ class PageApp:
                 self.tell(f"page: a wrong token was refused (from {request.client.host if request.client else '?'})")
             return JSONResponse({"error": "the token is not the loop's; it prints its token at its start"}, 401)
         wanted = await _json(request)
-        if not isinstance(wanted, dict) or wanted.get("do") in {"state", "about", "inputs", "courses", "picture"}:
+        if not isinstance(wanted, dict) or wanted.get("do") in LOOKS:
             raise HTTPException(400, 'a change is an object with "do"')
         if wanted.get("do") == "swap" and not _is_name(wanted.get("value")):
             raise HTTPException(400, "the page tries only files that lie beside the controller in charge, by name")
@@ -247,17 +253,20 @@ class PageApp:
             return JSONResponse({"error": first_line(error)}, 404)
 
     async def what_if(self, request: Request) -> Response:
-        """Courses after some changes, which are not made, beside those without them."""
+        """Courses after some changes, or with courses to come, which are not made, beside those without them."""
         wanted = await _json(request)
-        changes = wanted.get("changes") if isinstance(wanted, dict) else None
-        if not isinstance(changes, dict) or not changes:
-            raise HTTPException(400, 'a what-if is {"changes": {the name of a set point or entry: a number}}')
+        if not isinstance(wanted, dict) or not wanted or set(wanted) - {"changes", "course"}:
+            raise HTTPException(400, WHAT_IF)
+        changes, course = wanted.get("changes", {}), wanted.get("course")
+        if not isinstance(changes, dict) or (not changes and course is None):
+            raise HTTPException(400, WHAT_IF)
         if self._looking >= WAITING_LOOKS:
             raise HTTPException(503, "many changes are being looked at; ask again in a moment", {"Retry-After": "1"})
         self._looking += 1
         try:
             async with self._looks:
-                return JSONResponse(await asyncio.to_thread(self._foresight.what_if, changes))
+                speed = 1.0 if course is None else (await self._about())["speed"] or 1.0
+                return JSONResponse(await asyncio.to_thread(self._foresight.what_if, changes, course, speed))
         except LoopwrightError as error:
             return JSONResponse({"error": first_line(error), **({"entry": error.entry} if error.entry else {})}, 409)
         finally:

@@ -191,11 +191,11 @@ class Courses:
         done = self.end([name for name, of in self._of.items() if of.times_s[-1] <= self.now_s])
         self.finished, self._left = (*self._left, *done), ()
 
-    def ahead(self, manifest: Manifest, sp: Array, dv: ArrayLike | None) -> Array | None:
+    def ahead(self, manifest: Manifest, sp: Array, dv: ArrayLike | None, samples: int | None = None) -> Array | None:
         """``ahead`` (N n,) of a controller at this scan, within its signals' ranges.
 
         None where it reads none or nothing is to come. ``sp`` (n_sp,) and ``dv`` (n_dv,) are the present values of the
-        loop's signals.
+        loop's signals. ``samples`` is how many are known, N unless given.
         """
         if not self._of or manifest.ahead is None or "ahead" not in manifest.inputs:
             return None
@@ -203,7 +203,7 @@ class Courses:
         measured = np.full(len(self._dv), np.nan) if dv is None else np.asarray(dv, dtype=np.float64).reshape(-1)
         known |= dict(zip((s.name for s in self._dv), measured.tolist(), strict=True))
         now = self.now_s
-        times: Array = now + self._period_s * np.arange(1.0, manifest.ahead.horizon + 1)
+        times: Array = now + self._period_s * np.arange(1.0, (samples or manifest.ahead.horizon) + 1)
         change = np.zeros((len(times), len(manifest.ahead.signals)))
         for i, s in enumerate(manifest.ahead.signals):
             if s.signal in self._of:

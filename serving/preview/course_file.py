@@ -1,17 +1,62 @@
-"""Courses in a CSV file: a column of times, and one of values for each signal."""
+"""Courses as somebody gives them: a CSV file with a column of times and one a signal, or a request with points."""
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import shown
+from loopwright.serving.preview.course import Points
 
 TIME_COLUMNS = ("time", "time_s")
 LARGEST_FILE = 20_000_000  # bytes: far above the points that a course may have
+
+
+class AskedCourse(NamedTuple):
+    """Courses that a request gives: points by signal, the signals that run straight, and those whose course ends."""
+
+    points: Mapping[str, Points]
+    straight: tuple[str, ...] = ()
+    ended: tuple[str, ...] = ()
+    filed: bool = False  # whether they stood in a file
+
+
+def asked_course(value: Any, now_s: float, speed: float = 1.0) -> AskedCourse:
+    """The courses of a request's value: points, the text of a file, or names of courses to end.
+
+    Times and ``speed`` are as of ``courses_of``. LoopError for anything else, and with the ``entry`` csv for a file.
+    """
+    if isinstance(value, Mapping) and set(value) == {"end"} and _are_names(value["end"]):
+        return AskedCourse({}, ended=tuple(value["end"]))
+    if not isinstance(value, Mapping) or not _is_course(value):
+        raise LoopError(
+            'a course needs {"points": {NAME: [[time_s, value], ..]}, "straight": [NAME, ..]}, {"csv": the text of a '
+            'file, "straight": [NAME, ..]}, or {"end": [..]}'
+        )
+    straight = tuple(value.get("straight", ()))
+    if "csv" not in value:
+        return AskedCourse(value.get("points", {}), straight)
+    try:
+        return AskedCourse(courses_of(value["csv"], now_s, "the file", speed), straight, filed=True)
+    except LoopError as error:
+        error.entry = "csv"
+        raise
+
+
+def _is_course(value: Mapping[Any, Any]) -> bool:
+    """Whether a request has points or the text of a file, and names that run straight."""
+    if set(value) - {"straight"} not in ({"points"}, {"csv"}, set()):
+        return False
+    return _are_names(value.get("straight", [])) and isinstance(value.get("csv", ""), str)
+
+
+def _are_names(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(name, str) for name in value)
 
 
 def read_courses(path: Path, now_s: float, speed: float = 1.0) -> dict[str, list[tuple[float, float]]]:

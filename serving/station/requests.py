@@ -7,17 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
-from loopwright.serving.active_controller import require_fits
 from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.fields import is_number, nearest, shown
+from loopwright.serving.in_charge.adapted import require_fits
 from loopwright.serving.journal.entries import Kind
 from loopwright.serving.loop import ControlLoop, Mode, within
 from loopwright.serving.manifest import Signal
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.preview.course import described
-from loopwright.serving.preview.course_file import courses_of
+from loopwright.serving.preview.course_file import asked_course
 from loopwright.serving.station.change_words import by_hand_words, moved_words, operate_words
 from loopwright.serving.station.recorder import named
 from loopwright.serving.trust import require_accepted, signer
@@ -203,25 +203,20 @@ def ended_words(names: Sequence[str]) -> str:
 
 
 def _course(request: Request, loop: ControlLoop, _: Opened) -> Change:
-    value = request.value
-    if value is None or (isinstance(value, Mapping) and set(value) == {"end"} and _are_names(value["end"])):
-        names = tuple(loop.courses.ends) if value is None else tuple(value["end"])
+    # Dates of a file are those of the clock, which a plant for trials may outrun.
+    speed = loop.clock.speed if isinstance(loop.clock, MonotonicClock) else 1.0
+    value = {"end": list(loop.courses.ends)} if request.value is None else request.value
+    points, straight, names, filed = asked_course(value, time.time(), speed)
+    if set(value) == {"end"}:
         without = [name for name in names if name not in loop.courses.ends]
         if without or not names:
             raise LoopError(f"{', '.join(without) or 'no signal'} has a course now")
         what = f"the course of {', '.join(names)} ends"
         return Change(lambda loop: _ended(loop, names), what, request.who, request.reason)
-    if not isinstance(value, Mapping) or not _is_course(value):
-        raise LoopError(
-            'a course needs {"points": {NAME: [[time_s, value], ..]}, "straight": [NAME, ..]}, {"csv": the text of a '
-            'file, "straight": [NAME, ..]}, or {"end": [..]}'
-        )
-    straight = tuple(value.get("straight", ()))
     try:
-        points = _filed(value["csv"], loop) if "csv" in value else value.get("points", {})
         loop.require_course(points, straight)
     except LoopError as error:
-        error.entry = "csv" if "csv" in value else error.entry
+        error.entry = "csv" if filed else error.entry
         raise
     m = loop.manifest
     return Change(
@@ -232,25 +227,8 @@ def _course(request: Request, loop: ControlLoop, _: Opened) -> Change:
     )
 
 
-def _is_course(value: Mapping[Any, Any]) -> bool:
-    """Whether a request has points or the text of a file, and names that run straight."""
-    if set(value) - {"straight"} not in ({"points"}, {"csv"}, set()):
-        return False
-    return _are_names(value.get("straight", [])) and isinstance(value.get("csv", ""), str)
-
-
-def _filed(text: str, loop: ControlLoop) -> dict[str, list[tuple[float, float]]]:
-    """The courses in the text of a file; its dates are those of the clock, which a plant for trials may outrun."""
-    speed = loop.clock.speed if isinstance(loop.clock, MonotonicClock) else 1.0
-    return courses_of(text, time.time(), "the file", speed)
-
-
 def _ended(loop: ControlLoop, names: Sequence[str]) -> None:
     loop.courses.end(names)
-
-
-def _are_names(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(name, str) for name in value)
 
 
 def _mv(request: Request, loop: ControlLoop, _: Opened) -> Change:

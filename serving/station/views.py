@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from loopwright.serving.active_controller import LawInputs
 from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample
+from loopwright.serving.in_charge.active_controller import LawInputs
 from loopwright.serving.journal import columns
 from loopwright.serving.loop import Command, ControlLoop
 from loopwright.serving.monitor import Verdict
@@ -195,14 +195,18 @@ def _standing(course: Course, now_s: float) -> View:
 
 def courses(station: Station) -> View:
     """The points of the courses that stand: those to come and the last one before, in seconds from the course's end."""
-    seen, rows = station.snapshot, list[View]()
-    for course in () if seen is None else seen.courses.values():
-        assert seen is not None
-        first = max(0, int(np.searchsorted(course.times_s, seen.next_s, side="right")) - 1)
-        times, values = (course.times_s[first:] - course.times_s[-1]).tolist(), course.values[first:].tolist()
-        row = {"signal": course.signal, "straight": course.straight, "points": list(zip(times, values, strict=True))}
-        rows.append({**row, "who": course.who, "number": course.number})
-    return {"courses": rows}
+    seen = station.snapshot
+    return {
+        "courses": [] if seen is None else [_pointed(of, seen.next_s, of.times_s[-1]) for of in seen.courses.values()]
+    }
+
+
+def _pointed(course: Course, now_s: float, begin_s: float) -> View:
+    """The points of a course that are to come and the last one before, in seconds from ``begin_s``."""
+    first = max(0, int(np.searchsorted(course.times_s, now_s, side="right")) - 1)
+    times, values = (course.times_s[first:] - begin_s).tolist(), course.values[first:].tolist()
+    row = {"signal": course.signal, "straight": course.straight, "points": list(zip(times, values, strict=True))}
+    return {**row, "who": course.who, "number": course.number}
 
 
 def inputs(station: Station) -> View:
@@ -222,6 +226,15 @@ def inputs(station: Station) -> View:
         "inputs": {name: value.tolist() for name, value in seen.inputs.values.items()},
         "operate": seen.inputs.operate.tolist(),
     }
+
+
+def future(station: Station) -> View:
+    """The same inputs, and the courses that stand, in seconds from that step: for who computes what comes after it."""
+    found, seen = inputs(station), station.snapshot
+    assert seen is not None
+    assert seen.inputs is not None
+    begin = seen.inputs.course_s
+    return {**found, "courses": [_pointed(of, begin, begin) for of in seen.courses.values()]}
 
 
 def _plain(values: Iterable[float] | None) -> list[float | None] | None:
@@ -276,6 +289,7 @@ VIEWS: Mapping[str, Callable[[Station], View]] = {
     "about": about,
     "state": state,
     "inputs": inputs,
+    "future": future,
     "courses": courses,
     "picture": _pictured,
 }

@@ -67,7 +67,7 @@ def test_a_file_keeps_the_limit_of_one_mv_and_says_it(tmp_path: Path) -> None:
     manifest = export(law, tmp_path / "law.onnx", case="made", provenance={})
     assert [s.max_move for s in manifest.mv] == [0.05, None]
     controller, mv = Controller(tmp_path / "law.onnx"), np.zeros(2)
-    assert "  u0  -1 .. 1 V, moves at most 0.05 V a period\n  u1  -1 .. 1 V\n" in card(controller)
+    assert "  u0  -1 .. 1 V, moves at most 0.05 V a period (1 s)\n  u1  -1 .. 1 V\n" in card(controller)
     state, moved = controller.cold_state(), np.zeros(2)
     for k in range(20):
         sp = np.array([2.0, -2.0]) * (-1) ** (k // 5)

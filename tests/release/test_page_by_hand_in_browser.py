@@ -122,6 +122,28 @@ def test_a_variable_that_is_taken_out_is_said_to_be_held_by_nothing(page: Page, 
     expect(page.locator("#alarm-list .alarm.active", has_text="y0")).to_have_count(0)
 
 
+def test_an_mv_that_goes_to_its_rest_is_named_where_nothing_holds_the_variable(page: Page, steered: Steered) -> None:
+    """A level that is left out drifts while its outlet goes to where it rests."""
+    loop, _ = steered
+    loop.does("operate", {"u1.rest": 0.9, "u1.rest_use": 1.0})
+    expect(fact(page, "u1", "rest")).to_contain_text("0.9")
+    page.click('[data-change="y1"]')
+    page.select_option('[data-field="y1.use"]', "0")
+    expect(page.locator("#dialog-foreseen [data-note]").first).to_contain_text("y1")
+    note = page.locator("#dialog-foreseen [data-note]").filter(has_text="u1 goes to its resting value")
+    expect(note).to_contain_text("y1")
+    page.select_option('[data-field="y1.use"]', "1")
+    expect(note).to_have_count(0)
+    page.click("#cancel")
+    loop.does("operate", {"u1.rest_use": 0.0})
+
+
+def test_what_happened_names_no_program(page: Page) -> None:
+    expect(page.locator("#events")).to_contain_text("the settings")
+    for name in ("loop.toml", "opcua"):
+        expect(page.locator("#events .who").filter(has_text=name)).to_have_count(0)
+
+
 def test_a_sensor_that_is_lost_is_in_the_list_and_an_alarm(page: Page, steered: Steered) -> None:
     _, plant = steered
     plant.bad = ("", "BadSensorFailure")

@@ -13,6 +13,7 @@ from operated_page import TOKEN, served
 from plant_servers import RunningLoop
 from predictive_loops import law_of
 
+from loopwright.pipeline.export.explain_graph import export_explanation
 from loopwright.pipeline.export.gate import export
 
 if CHROMIUM is None:
@@ -29,8 +30,9 @@ FAR = 3000  # seconds of the loop from now: ten minutes of the clock, longer tha
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningLoop]:
     """A loop on its own model whose law reads what is to come."""
     folder = tmp_path_factory.mktemp("recipe")
-    law = law_of(random_model(3, n_y=2, n_mv=2, n_dv=1), horizon=10, preview="course")
+    law = law_of(random_model(3, n_y=2, n_mv=2, n_dv=1), horizon=10, preview="course", operate={})
     export(law, folder / "law.onnx", case="made", provenance={})
+    export_explanation(law, folder / "law.onnx")
     made = served(folder / "law.onnx", folder)
     yield made
     made.end()
@@ -141,6 +143,43 @@ def test_a_time_by_the_clock_is_one_of_the_loop_which_runs_faster(page: Page, re
     assert course.straight
 
 
+def foreseen(page: Page, signal: str) -> list[float]:
+    """Where a signal would be in the end: as it is, and with what is asked for."""
+    row = page.locator("#dialog-foreseen tbody tr").filter(has=page.get_by_role("rowheader", name=signal))
+    expect(row).to_have_count(1)
+    return [float(text.split()[0]) for text in row.locator("td").all_text_contents()[:2]]
+
+
+def test_a_course_is_looked_at_before_it_is_given_and_before_it_is_ended(page: Page, recipe: RunningLoop) -> None:
+    page.click("#course-by-hand")
+    page.select_option("#course-times", "s")
+    page.locator('[data-what="time"]').first.fill("30")
+    page.fill('[data-field="y0.1"]', "0.5")
+    expect(page.locator("#dialog-foreseen caption")).to_contain_text("40 s")  # the step, and the law's ten samples
+    expect(page.locator("#dialog-foreseen tbody svg polyline")).to_have_count(2 * 4)
+    without, given = foreseen(page, "y0")
+    assert abs(given - 0.5) < 0.1 < abs(without - 0.5)
+    page.fill('[data-field="y0.1"]', "7")
+    expect(page.locator('[id="wrong-y0.1"]')).to_contain_text("y0")  # before anybody confirms it
+    expect(page.locator("#dialog-foreseen table")).to_have_count(0)
+    page.fill('[data-field="y0.1"]', "0.5")
+    page.locator('[data-what="time"]').first.fill(str(FAR))
+    expect(page.locator("#dialog-foreseen [data-note]").last).to_contain_text("50 min")  # goes on beyond what is shown
+    assert courses(recipe) == {}
+    page.locator('[data-what="time"]').first.fill("100")
+    confirmed(page)
+    page.locator('[data-course-of="y0"]').get_by_role("button").click()
+    expect(page.locator("#dialog-foreseen table")).to_be_visible()
+    page.click("#cancel")
+    page.click("#course-by-file")
+    file: Any = {"name": "recipe.csv", "mimeType": "text/csv", "buffer": b"time,y1\n5,-0.3\n"}
+    page.set_input_files("#course-file", files=[file])
+    expect(page.locator("#dialog-foreseen table")).to_be_visible()
+    without, given = foreseen(page, "y1")
+    assert abs(given + 0.3) < abs(without + 0.3)
+    page.click("#cancel")
+
+
 def test_a_file_gives_several_and_what_is_wrong_in_it_stands_beside_it(page: Page, recipe: RunningLoop) -> None:
     page.click("#course-by-file")
 
@@ -190,6 +229,7 @@ def test_a_phone_gives_one_without_scrolling_sideways(browser: Browser, recipe: 
     phone.select_option("#course-times", "clock")
     phone.fill('[data-field="y0.1"]', "0.1")
     dialog = phone.locator("#dialog")
+    expect(phone.locator("#dialog-foreseen table")).to_be_visible()
     assert dialog.evaluate("e => e.scrollWidth <= e.clientWidth + 1 && e.offsetWidth <= 390")
     assert phone.locator('[data-what="time"]').evaluate("e => e.scrollWidth <= e.clientWidth + 1")
     phone.locator("#confirm").tap()

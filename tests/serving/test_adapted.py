@@ -25,7 +25,7 @@ from loopwright.serving import (
     Signal,
     default_guards,
 )
-from loopwright.serving.active_controller import AdaptedController, adapted
+from loopwright.serving.in_charge.adapted import AdaptedController, adapted
 from loopwright.serving.journal import columns
 from loopwright.serving.trust import signer
 

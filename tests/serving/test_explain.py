@@ -89,7 +89,7 @@ def test_the_courses_have_names_units_and_times(explainer: Explainer) -> None:
     assert row["courses"][2]["times_s"] == [float(k) for k in LAW.moves.starts]
     assert all(len(c["values"]) == len(c["times_s"]) for c in row["courses"])
     assert set(row["moves"][0]) == {"mv", "unit", "move", "parts", "sentence"}
-    assert set(row["moves"][0]["parts"][0]) == {"cause", "signal", "value"}
+    assert set(row["moves"][0]["parts"][0]) == {"cause", "signal", "value", "in_s"}
 
 
 def test_a_disturbance_is_named_with_its_direction(explainer: Explainer) -> None:
@@ -224,10 +224,13 @@ def test_shares_are_of_each_side_and_small_ones_are_not_named() -> None:
 def test_a_resting_value_is_never_said_to_hold_back_what_goes_to_it() -> None:
     """The plan may go to it in a roundabout way; the words then say so, of this MV alone."""
     parts = [MovePart("setpoint", "LI-1", 5.0), MovePart("rest", "FV-3", -2.0)]
-    towards, away = (sentence_of(3.0, 100.0, parts, {}, {"FV-3": far}) for far in (-20.0, 20.0))
+    away_from_it, to_it = (sentence_of(3.0, 100.0, parts, {}, {"FV-3": far}) for far in (-20.0, 20.0))
     another = sentence_of(3.0, 100.0, parts, {})
-    assert towards == another != away
-    assert "FV-3" in away
+    assert away_from_it == another != to_it
+    assert "FV-3" in away_from_it
+    assert "FV-3" not in to_it  # it goes there: the rest holds nothing back
+    stands = sentence_of(0.0, 100.0, [MovePart("setpoint", "LI-1", 2.0), parts[1]], {}, {"FV-3": 20.0})
+    assert "FV-3" in stands
 
 
 def test_a_side_that_hardly_counts_is_not_named() -> None:
@@ -254,3 +257,29 @@ def test_the_words_of_a_rest_follow_its_way(explainer: Explainer) -> None:
             plain.add(towards)
     assert about
     assert True in plain
+
+
+def test_an_mv_is_at_a_limit_only_where_it_stands_there_or_its_next_move_ends_there(explainer: Explainer) -> None:
+    """Of every limit that the plan meets: now or next, or later, and then when, as the planned course has it."""
+    inputs, _ = at_rest(explainer, 20)
+    operate, seen = Operate(explainer.manifest.operate), {"now": 0, "later": 0}
+    for high in (0.15, 0.3, 0.6):
+        for most in (0.02, 0.1, 1.0):
+            for sp in (0.3, -0.3):
+                ends = {
+                    f"u{i}.{what}": v
+                    for i in (0, 1)
+                    for what, v in (("high", high), ("low", -high), ("max_move", most))
+                }
+                found = explainer.explain(**{**inputs, "sp": inputs["sp"] + sp, "operate": operate.with_values(ends)})
+                for move in found.moves:
+                    for part in (p for p in move.parts if p.cause in ("mv_low", "mv_high")):
+                        course, limit = found.course(part.signal), high if part.cause == "mv_high" else -high
+                        at = [abs(v - limit) <= 2e-6 for v in course.values]
+                        stands = inputs["mv_applied"][int(part.signal[1])]
+                        when = 0.0 if abs(stands - limit) <= 2e-6 else course.times_s[at.index(True)]
+                        assert part.in_s == when
+                        seen["later" if when else "now"] += 1
+                        said = move.sentence.count(f"{part.signal} at its"), move.sentence.count(f"{part.signal} will")
+                        assert said[0 if when else 1] == 0
+    assert min(seen.values()) > 3, seen

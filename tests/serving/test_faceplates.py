@@ -15,8 +15,8 @@ from plant_servers import RunningLoop
 from processes import within
 
 from loopwright.serving import Controller, ControlLoop, LoopError, Mode, Sample
-from loopwright.serving.active_controller import AdaptedController
 from loopwright.serving.errors import ContractError
+from loopwright.serving.in_charge.adapted import AdaptedController
 from loopwright.serving.monitor import Monitor
 from loopwright.serving.page.foresight import LawForesight
 from loopwright.serving.page.prometheus import metrics_text
@@ -121,7 +121,7 @@ def test_the_request_inputs_is_answered_at_the_door(running: RunningLoop) -> Non
 def test_before_the_first_step_there_are_no_inputs() -> None:
     with pytest.raises(LoopError):
         inputs(SimpleNamespace(snapshot=None))  # type: ignore[arg-type]
-    assert set(VIEWS) == {"about", "state", "inputs", "courses", "picture"}
+    assert set(VIEWS) == {"about", "state", "inputs", "future", "courses", "picture"}
 
 
 @pytest.mark.parametrize(

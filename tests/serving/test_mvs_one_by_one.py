@@ -402,4 +402,4 @@ def named(loop: ControlLoop) -> dict[str, float]:
 
 
 def lost(loop: ControlLoop) -> bool:
-    return loop._applied.lost
+    return loop._mv.lost

@@ -137,7 +137,7 @@ def test_only_a_request_of_the_page_itself_with_the_token_changes_anything(
     assert browser.send("POST", "/api/what-if", b"x" * 20_000, own)[0] == 413  # which asks for no token
     assert browser.change(b"{")[0] == 400
     assert browser.change(b"[" * 5_000)[0] == 400
-    for view in ("state", "about", "inputs", "courses", "picture"):
+    for view in ("state", "about", "inputs", "future", "courses", "picture"):
         assert browser.change({"do": view})[0] == 400
     assert browser.get("/api/change")[0] == 405
     assert browser.get("/", Host="evil.example")[0] == 421

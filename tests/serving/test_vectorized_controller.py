@@ -19,7 +19,7 @@ ROWS = 5
 def given(k: int) -> dict[str, np.ndarray]:
     """Inputs (ROWS, n) of a step."""
     rng = np.random.default_rng(k)
-    return {name: rng.uniform(-0.5, 0.5, (ROWS, n)) for name, n in (("sp", 2), ("pv", 2), ("dv", 1))}
+    return {name: rng.uniform(-0.15, 0.15, (ROWS, n)) for name, n in (("sp", 2), ("pv", 2), ("dv", 1))}
 
 
 @pytest.mark.parametrize("steered", [False, True])

@@ -35,12 +35,12 @@ export async function change(wanted, token) {
   return found.done;
 }
 
-// Courses after changes by name; it changes nothing, so it needs no token.
-export async function foresee(changes) {
+// Courses after {changes: by name} or with {course: to come}; it changes nothing, so it needs no token.
+export async function foresee(body) {
   const answer = await fetch("/api/what-if", {
     method: "POST",
     headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ changes }),
+    body: JSON.stringify(body),
     signal: AbortSignal.timeout(PATIENCE_MS),
   });
   const found = await answer.json().catch(() => ({}));

@@ -1,11 +1,13 @@
 // A course that an operator gives: steps of a signal by hand, or a file of several signals.
 import { ask } from "./dialog.js";
 import { clock, element, number, unit, zone } from "./format.js";
+import { foreseeCourse } from "./operate.js";
 
 const UNITS = { s: 1, min: 60, h: 3600 };
 const CLOCK = "clock";
 const FIRST_S = 600; // from now, where the first step stands before it is changed
 const LONGEST_FILE = 90_000; // bytes: what a request may have, with some of them for the rest of it
+const LONGEST_LOOK = 9_000; // bytes of a file that is looked at beforehand, for which nobody has to have the token
 const HOLDS = [["", "holds each value until the next"], ["straight", "runs straight to each value"]];
 let heard = { time: 0, at: 0 }; // a time of the loop, and when this browser heard of it
 
@@ -92,6 +94,7 @@ export function byHand(about) {
 
   const given = () => rows().map((row) => [seconds(field(row, "time")), Number(field(row, "value").value)]);
   const straight = () => way.value && !way.closest("label").hidden;
+  const value = () => ({ points: { [signal.value]: given() }, ...(straight() ? { straight: [signal.value] } : {}) });
   const range = element("p", { class: "hint" });
   const body = element("div", {}, labelled("Signal", signal), labelled("Times", times), labelled("The set point", way), range, steps, more);
   let before = times.value;
@@ -119,10 +122,8 @@ export function byHand(about) {
       const shown = filled.map((row) => `${number(Number(field(row, "value").value), s)} ${unit(s)}`.trim() + ` at ${shownTime(now() + seconds(field(row, "time")) / speed)}`);
       return shown.length ? `${s.name}: ${shown.join(", ")}` : "";
     },
-    request: () => ({
-      do: "course",
-      value: { points: { [signal.value]: given() }, ...(straight() ? { straight: [signal.value] } : {}) },
-    }),
+    foresee: () => (rows().every((row) => field(row, "value").value !== "" && Number.isFinite(seconds(field(row, "time")))) ? foreseeCourse(value()) : null),
+    request: () => ({ do: "course", value: value() }),
   });
 }
 
@@ -135,6 +136,10 @@ export function byFile(about) {
   const ways = element("fieldset", {}, element("legend", {}, "Runs straight to each value, and does not hold it until the next"), ...lines);
   let text = "";
   let said = "";
+  function value() {
+    const straight = boxes.filter((box) => box.checked).map((box) => box.value);
+    return { csv: text, ...(straight.length ? { straight } : {}) };
+  }
   file.addEventListener("change", async () => {
     const chosen = file.files[0];
     [text, said] = ["", ""];
@@ -150,12 +155,16 @@ export function byFile(about) {
     words: "A CSV file: a column of times, and one of values for each signal. Times are seconds from now, or as 2026-03-01T14:30 (UTC).",
     body: element("div", {}, labelled("File", file), wrongLine("csv"), lines.length ? ways : null),
     said: () => said,
+    foresee: () => {
+      if (!text) return null;
+      if (new Blob([text]).size > LONGEST_LOOK) return element("p", { class: "hint" }, `A file of more than ${LONGEST_LOOK} bytes is not looked at beforehand.`);
+      return foreseeCourse(value());
+    },
     request: () => {
       if (new Blob([text]).size > LONGEST_FILE) {
         throw Object.assign(new Error(`The file has more than ${LONGEST_FILE} bytes. Give fewer points, or use the command: loopwright loop course.`), { entry: "csv" });
       }
-      const straight = boxes.filter((box) => box.checked).map((box) => box.value);
-      return { do: "course", value: { csv: text, ...(straight.length ? { straight } : {}) } };
+      return { do: "course", value: value() };
     },
   });
 }

@@ -3,6 +3,7 @@ import { get } from "./api.js";
 import { ask } from "./dialog.js";
 import { byFile, byHand, shownTime } from "./course_entry.js";
 import { duration, element, number, say, unit } from "./format.js";
+import { foreseeCourse } from "./operate.js";
 
 const $ = (id) => document.getElementById(id);
 const SHARE = 0.4; // of the time that is shown, which the future may have beside it
@@ -188,6 +189,7 @@ function askEnd(names) {
     words: names.every(isDv)
       ? "The disturbance counts as it is measured."
       : "A set point stays where it is now; a disturbance counts as it is measured.",
+    foresee: () => foreseeCourse({ end: names }),
     request: () => ({ do: "course", value: { end: names } }),
   });
 }

@@ -12,6 +12,7 @@ let pending = null; // what is asked for now; an answer to an earlier one does n
 // sent. A field with `now` is sent only where the operator changed it, so that rounding moves nothing. foresee(values):
 // an element that shows what the values would do, or null. In place of fields a `body` may be asked in, an element of which
 // `said()` tells in a line what is given, and `request()` makes what is sent; it throws an error with `entry` where it cannot.
+// `foresee()` then has no values. A dialog that asks for no value is looked at when it opens.
 export function ask({ title, words, fields = [], body = null, said = null, request, foresee = null }) {
   const opener = document.activeElement;
   pending = { fields, body, said, request, foresee, touched: new Set(), opener, place: opener?.closest("section") };
@@ -27,6 +28,7 @@ export function ask({ title, words, fields = [], body = null, said = null, reque
   moves();
   $("dialog-foreseen").replaceChildren();
   $("dialog").showModal();
+  if (!body && !fields.length) look();
   const first = $("dialog").querySelector("#dialog-fields input, #dialog-fields select");
   (first || ($("who").value ? $("why") : $("who"))).focus();
 }
@@ -75,7 +77,7 @@ function look() {
     let shown = [];
     wrong(null);
     try {
-      const asked = Object.keys(values).length ? mine.foresee(values) : null;
+      const asked = Object.keys(values).length || !mine.fields.length ? mine.foresee(values) : null;
       if (asked) $("dialog-foreseen").replaceChildren(element("p", { class: "hint" }, "The law is asked what it would do…"));
       shown = [await asked].filter(Boolean);
     } catch (error) {

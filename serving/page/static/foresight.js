@@ -1,7 +1,7 @@
 // Courses that the law predicts and plans, why it moves, and what it would do after a change. The page's server computes it
 // beside the loop, from the inputs of the loop's last step.
 import { duration, element, figure, number, unit } from "./format.js";
-import { foresee, get } from "./api.js";
+import { get } from "./api.js";
 
 const AGAIN_MS = 10_000; // after a refusal: a law that is not stepped yet will be, a file that is missing may come
 const SHARE = 0.4; // of the time that is shown, which the future may have beside it
@@ -123,49 +123,6 @@ export function draw(u, signal, kind, color) {
   return end;
 }
 
-// ------------------------------------------------------------------------------------------- before a change is set
-export const foresees = () => found !== null;
-
-// A table of what the signals would do after a change by name, beside what they do without it, and what it does not show.
-// ranges(signal): [low, high] that operators have set, or null.
-export async function whatIf(changes, signals, ranges) {
-  const { before, after } = await foresee(changes);
-  const values = (of, signal) => of.courses.find((c) => c.signal === signal.name)?.values;
-  const rows = signals.filter((s) => values(after, s) !== undefined);
-  const last = Math.max(...after.courses.map((c) => c.times_s.at(-1)));
-  const cell = (s, of) => element("td", {}, `${number(values(of, s).at(-1), s)} ${unit(s)}`.trim());
-  const between = (s) => [Math.min, Math.max].map((of) => number(of(...values(after, s)), s)).join(" … ");
-  const table = element(
-    "table",
-    {},
-    element("caption", {}, `${auto ? "In" : "In AUTO, after"} ${duration(last)}, by the law's own model`),
-    element("thead", {}, element("tr", {}, ...["", "as it is", "changed", "on the way"].map((words) => element("th", {}, words)))),
-    element("tbody", {}, ...rows.map((s) => element("tr", {}, element("th", { scope: "row" }, s.name), cell(s, before), cell(s, after), element("td", {}, between(s))))),
-  );
-  const notes = [...rows.flatMap((s) => unheld(s, changes, values(after, s), ranges(s), last)), ...onward(rows, changes, (s) => values(after, s), last)];
-  return element("div", {}, table, ...notes.map((words) => element("p", { class: "hint", "data-note": "" }, words)));
-}
-
-const STILL = 2e-3; // of a signal's range: what moves by more over the last fifth of the horizon has not come to rest
-const fifth = (of) => of.at(-1) - of.at(-1 - Math.ceil(of.length / 5));
-const way = (s, of) => (Math.abs(fifth(of)) <= STILL * (s.high - s.low) ? "" : fifth(of) > 0 ? "rises" : "falls");
-
-// A variable that the change takes out: whether it leaves its range, or goes on and on, as a level does.
-function unheld(s, changes, course, range, last) {
-  if (changes[`${s.name}.use`] !== 0) return [];
-  const [low, high] = ["low", "high"].map((end, k) => changes[`${s.name}.${end}`] ?? range?.[k] ?? s[end]);
-  const gone = course.findIndex((v) => v < low || v > high);
-  if (gone < 0) return [`Nothing holds ${s.name} then.${way(s, course) && ` After ${duration(last)} it still ${way(s, course)}.`}`];
-  const time = duration(((gone + 1) * last) / course.length);
-  return [`▲ Nothing holds ${s.name} then: after ${time} it is ${course[gone] > high ? "above" : "below"} its range, ${number(low, s)} … ${number(high, s)} ${unit(s)}`.trim() + "."];
-}
-
-// The end of the horizon is not the end of what happens.
-function onward(rows, changes, course, last) {
-  const moving = rows.filter((s) => way(s, course(s))).map((s) => `${s.name} still ${way(s, course(s))}`);
-  const costs = Object.keys(changes).some((name) => name.endsWith(".cost"));
-  return [
-    ...(moving.length ? [`The plant does not rest after ${duration(last)}: ${moving.join(", ")}.`] : []),
-    ...(costs ? ["A cost acts slowly. It moves the plant on until a range or a limit stops it."] : []),
-  ];
-}
+// Whether the law can be asked what it would do, as far as is known, and whether it moves the plant now.
+export const foresees = () => steers && !missing;
+export const moves = () => auto;

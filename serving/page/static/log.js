@@ -5,6 +5,7 @@ import { clock, element, here, say } from "./format.js";
 
 const $ = (id) => document.getElementById(id);
 const MOST = 300;
+const WHO = { loop: "the loop", plant: "the plant", monitor: "the monitor", opcua: "the connection", "loop.toml": "the settings" };
 const known = new Map();
 let came = null; // events that come in while the list is loaded: they are newer than it
 let drawn = "";
@@ -78,7 +79,7 @@ function happened(e) {
     "li",
     { "data-kind": e.kind },
     element("time", {}, clock(e.time)),
-    element("span", { class: "who" }, e.who),
+    element("span", { class: "who" }, WHO[e.who] || e.who),
     element("span", { class: "what" }, happenedTo(e) + (e.reason ? ` (${e.reason})` : "")),
   );
 }

@@ -2,6 +2,7 @@
 import { ask } from "./dialog.js";
 import * as foresight from "./foresight.js";
 import { duration, element, figure, number, say, unit } from "./format.js";
+import { whatIf } from "./what_if.js";
 
 const NEAR = 1e-6; // of a signal's range: nearer to a limit is at it
 const SOON = 0.5; // of the time for which a reading is bridged, after which somebody should look
@@ -277,4 +278,5 @@ function askBack(signal) {
 }
 
 // Courses of the signals after a change, where the law can be asked for it.
-export const foresee = (changes) => (foresight.foresees() ? foresight.whatIf(changes, signals, range) : null);
+export const foresee = (changes) => whatIf({ changes }, signals, value);
+export const foreseeCourse = (course) => whatIf({ course }, signals, value);
