@@ -32,7 +32,7 @@ from loopwright.serving.ranges import numbers, within
 
 Array: TypeAlias = NDArray[np.float64]
 NO_PART = 1e-13  # of an MV's range: a smaller part is none
-AT_LIMIT = 1e-6  # of an MV's range: nearer to a limit is at it
+HELD_WITHIN = 1e-6  # of an MV's range: nearer to a limit is at it
 # Share of an MV's range by which both graphs may differ and be one law. They round apart, and where the plan hardly
 # bends rounding grows: on a served tank with three valves for two variables by more than 1e-9.
 SAME_MV = 1e-6
@@ -286,7 +286,7 @@ class Explainer:
             (e.signal, e.what): v for e, v in zip(m.operate, operate.tolist(), strict=True) if e.group == "mv"
         }
         for i, s in enumerate(m.mv):
-            course, slack = np.array([applied[i], *z[:, i]]), AT_LIMIT * (s.high - s.low)
+            course, slack = np.array([applied[i], *z[:, i]]), HELD_WITHIN * (s.high - s.low)
             high, low = (set_ends.get((s.name, end), own) for end, own in (("high", s.high), ("low", s.low)))
             for cause, room in (("mv_high", min(high, s.high) - course), ("mv_low", course - max(low, s.low))):
                 place = int(np.argmin(np.maximum(room, slack)))  # the first one at the limit, else the nearest
