@@ -227,7 +227,7 @@ class MadePlant:
         self.shown = np.zeros(kind.n_y)
         self.sample: Sample | None = None
         self.written: Array | None = None
-        self.known: Array | None = None  # shape: (n_mv,), the last read-back that some actuator can have
+        self.known: Array | None = None  # shape: (n_mv,), the last read-back of each that an actuator can have
         self.mode: Callable[[], Mode] = lambda: Mode.MANUAL  # of the loop, now
         self.held = False  # whether HOLD moves nothing
         self.theirs: Callable[[], NDArray[np.bool_]] = lambda: np.zeros(
@@ -263,10 +263,13 @@ class MadePlant:
             self.sample = None
             raise EndpointError("no answer")
         applied = self.at + self.offset
+        before = applied.copy() if self.known is None else self.known
+        told = np.ones(kind.n_mv, dtype=bool)
         if rng.random() < 0.01:
-            applied[rng.integers(kind.n_mv)] = rng.choice([np.nan, 1e6, -1e6])
-        elif self.reads_back:
-            self.known = applied.copy()
+            i = rng.integers(kind.n_mv)
+            applied[i], told[i] = rng.choice([np.nan, 1e6, -1e6]), False
+        if self.reads_back and (told.all() or self.known is not None):
+            self.known = np.where(told, applied, before)  # each MV as it is read back: the loop goes on from there
         self.sample = Sample(
             pv=pv, mv_applied=applied if self.reads_back else None, dv=dv,
             age_s=float(rng.choice([0.0, 0.4, 5.0], p=[0.8, 0.19, 0.01])),

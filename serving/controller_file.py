@@ -99,11 +99,12 @@ def _differs(found: Any, wanted: Any, where: str) -> str:
 
 # ------------------------------------------------------------------------------------------------- files in a folder
 EXPLAIN_SUFFIX = ".explain.onnx"  # of the graph beside a controller's file that says why it moves
+BATCH_SUFFIX = ".batch1.onnx"  # of the graph with a leading batch of 1, in a conformance kit
 
 
 def controller_files(folder: Path) -> list[Path]:
-    """The controllers' files of a folder, by name; graphs that explain them are none."""
-    return sorted(path for path in folder.glob("*.onnx") if not path.name.endswith(EXPLAIN_SUFFIX))
+    """The controllers' files of a folder, by name; graphs that explain them, and those with a batch, are none."""
+    return sorted(path for path in folder.glob("*.onnx") if not path.name.endswith((EXPLAIN_SUFFIX, BATCH_SUFFIX)))
 
 
 # ------------------------------------------------------------------------------------------------- reading a file

@@ -293,7 +293,7 @@ class ControlLoop:
     def scan(self, sample: Sample) -> Command:
         """The MV of the next period. No I/O and no clock; no content of a sample raises an exception."""
         self._sp = self.courses.followed(self._sp, self.controller.manifest.sp)
-        sample = self._out.look(sample, self._active.mv_entries, lost=self._mv.lost)
+        sample = self._out.look(sample, self._active.mv_entries, lost=self._mv.untold)
         readings = self._active.look(sample, self._out.local.why)
         reason, self._refused_why = readings.reason, ""
         shown = self._mv.look(sample, reason, self.mode, self._active.in_hand)

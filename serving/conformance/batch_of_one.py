@@ -10,8 +10,6 @@ from loopwright.serving.graph.audit import audit
 from loopwright.serving.graph.onnx_bytes import Message, read_model, write_model
 from loopwright.serving.graph.work import DOUBLE, INT64
 
-SUFFIX = ".batch1.onnx"  # in the place of .onnx
-
 
 def batch_of_one(data: bytes) -> bytes:
     """The controller file ``data`` with inputs and outputs of shape (1, n) under the same names; sealed as it was.

@@ -14,11 +14,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.serving.conformance.batch_of_one import SUFFIX, batch_of_one
+from loopwright.serving.conformance.batch_of_one import batch_of_one
 from loopwright.serving.conformance.scans import Scanned, scanned, start
 from loopwright.serving.conformance.steps import OUTPUTS, StepResult, answered, beginnings
 from loopwright.serving.controller import Controller, runtime_version
-from loopwright.serving.controller_file import file_digest, sidecar
+from loopwright.serving.controller_file import BATCH_SUFFIX, file_digest, sidecar
 from loopwright.serving.errors import ContractError, LoopwrightError
 from loopwright.serving.guard import READ_BACK_MARGIN, InRange, Sample
 from loopwright.serving.words import plain
@@ -100,7 +100,7 @@ def write_kit(controller: Controller, folder: Path) -> dict[str, Any]:
     Raises LoopwrightError if the folder cannot be written.
     """
     batched = batch_of_one(controller.path.read_bytes())
-    batched_name = controller.path.with_suffix("").name + SUFFIX
+    batched_name = controller.path.with_suffix("").name + BATCH_SUFFIX
     vectors = vectors_of(controller)
     vectors["batch_of_one"] = {"file": batched_name, "sha256": file_digest(batched)}
     try:

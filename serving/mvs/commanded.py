@@ -65,6 +65,11 @@ class CommandedMV:
         """Whether the last command did not arrive, and no read-back has come since."""
         return self._plant.lost
 
+    @property
+    def untold(self) -> bool:
+        """Whether no read-back has told where they stand since a command was lost, or since others had them."""
+        return self._plant.lost or self._plant.taken
+
     # ------------------------------------------------------------------ operators
     def begun(self, mode: Mode, before: Mode, in_hand: Those) -> None:
         """Somebody changes the mode ``before``; MVs ``in_hand`` (n_mv,) stay so."""
@@ -73,9 +78,7 @@ class CommandedMV:
 
     def send(self, wanted: Array, signals: tuple[Signal, ...], taken: Those) -> None:
         """Begin the way to ``wanted`` (n_mv,), of those ``taken`` (n_mv,) out of use with it from the next scan on."""
-        self.now = self.out.hand.sent(self.now, wanted, signals, taken)
-        on_its_way = self.out.hand.wanted is not None
-        self._plant.take(self._plant.taken and on_its_way)  # else the MV is where it was sent
+        self.now = self.out.hand.sent(self.now, wanted, signals, taken, untold=self._plant.taken)
 
     def require_arrived(self) -> None:
         """LoopError while the last command is lost."""
@@ -97,8 +100,8 @@ class CommandedMV:
         if shown.applied is not None and (taken or blind):
             self.now = self._stood = shown.applied.copy()
         if shown.silent:
-            if shown.outside:
-                self.now = np.full(len(self.now), nan)
+            if shown.outside:  # the way by hand would begin nobody knows where
+                self.now, self.out.hand.wanted = np.full(len(self.now), nan), None
             doubled = not reason or shown.silent.startswith(reason)
             return shown if doubled else shown._replace(silent=reworded(reason, f"{reason}; {shown.silent}"))
         if self.found is not None:

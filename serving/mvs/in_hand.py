@@ -24,14 +24,19 @@ class ByHand:
     def __init__(self) -> None:
         self.wanted: Array | None = None  # shape: (n_mv,), NaN of those that are there; None: nobody moves any by hand
 
-    def sent(self, mv: Array, wanted: Array, signals: Sequence[Signal], taken: Those | None = None) -> Array:
+    def sent(
+        self, mv: Array, wanted: Array, signals: Sequence[Signal], taken: Those | None = None, *, untold: bool = False
+    ) -> Array:
         """Begin the way to ``wanted`` (n_mv,); the MV from now on, which is there already where it is not limited.
 
-        Those ``taken`` (n_mv,) out of use with it begin at the next scan, which shows where they stand.
+        Those ``taken`` (n_mv,) out of use with it begin at the next scan, which shows where they stand; and all, where
+        others had them until now and nothing has told where they stand (``untold``).
         """
         limited = np.array([s.most < np.inf for s in signals])
         limited = limited if taken is None else limited | taken
-        if limited.any() and np.isnan(mv).any():  # not known where they stand: nothing is written until it is
+        if untold or (
+            limited.any() and np.isnan(mv).any()
+        ):  # not known where they stand: nothing is written until it is
             limited[:] = True
         self.wanted = np.where(limited, wanted, np.nan)
         self._end()

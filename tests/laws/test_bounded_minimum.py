@@ -78,9 +78,7 @@ def test_two_changes_suffice_where_the_plan_before_has_nearly_its_bounds(seed: i
 
 @given(seeds, st.integers(1, 12), st.integers(0, 3), st.booleans())
 @some
-def test_the_plan_lies_within_its_bounds_and_costs_no_more_than_its_sweep(
-    seed: int, m: int, changes: int, swept: bool
-) -> None:
+def test_the_plan_lies_within_its_bounds(seed: int, m: int, changes: int, swept: bool) -> None:
     given = problem(seed, m, 0.01)
     z = found(given, changes, swept=swept)
     assert np.isfinite(z).all()

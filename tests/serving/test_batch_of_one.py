@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from shipped_files import SHIPPED
 
 from loopwright.serving import ArtifactError, Controller
-from loopwright.serving.conformance.batch_of_one import SUFFIX, batch_of_one
+from loopwright.serving.conformance.batch_of_one import batch_of_one
 from loopwright.serving.conformance.steps import OUTPUTS, answered
-from loopwright.serving.controller_file import unseal
+from loopwright.serving.controller_file import BATCH_SUFFIX, unseal
 from loopwright.serving.graph.onnx_bytes import read_model, write_model
 
 pytest_plugins = ["operated_laws", "course_files"]
@@ -76,7 +76,7 @@ def test_bytes_are_written_as_they_are_read() -> None:
 
 def test_the_kit_has_it_and_the_runtime_refuses_it(tmp_path: Path) -> None:
     folder = kit_of(SHIPPED[0])
-    data = (folder / (SHIPPED[0].stem + SUFFIX)).read_bytes()
+    data = (folder / (SHIPPED[0].stem + BATCH_SUFFIX)).read_bytes()
     assert data == batch_of_one(SHIPPED[0].read_bytes())
     copy = tmp_path / "law.onnx"
     copy.write_bytes(data)

@@ -274,6 +274,29 @@ def test_the_others_make_up_for_what_the_plant_does(slow_mvs: Controller, predic
     assert abs(plant.sample().pv[0] - 0.2) < 0.02
 
 
+# ------------------------------------------------------------------------------------------------ as a shadow ends
+@pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD, Mode.AUTO])
+@pytest.mark.parametrize("bad", [np.nan, 5.0])
+def test_one_bad_read_back_as_a_shadow_ends_writes_no_old_mv(slow_mvs: Controller, mode: Mode, bad: float) -> None:
+    """Others moved both MVs since the last scan; the last good read-back of the second is old."""
+    loop = ControlLoop(slow_mvs, sp=[0.2, -0.1], mode=Mode.SHADOW)
+    loop.scan(Sample(np.zeros(2), np.array([0.1, 0.1])))
+    loop.set_mode(mode)
+    assert not loop.scan(Sample(np.zeros(2), np.array([0.3, bad]))).writes
+    after = loop.scan(Sample(np.zeros(2), np.array([0.3, 0.3])))
+    assert after.writes
+    assert np.abs(after.mv - 0.3).max() <= MOST + 1e-12
+
+
+def test_one_mv_sent_by_hand_as_a_shadow_ends_leaves_the_other_where_it_is_read_back(slow_mvs: Controller) -> None:
+    loop = ControlLoop(slow_mvs, sp=[0.2, -0.1], mode=Mode.SHADOW, operate={"u0.use": 0.0})
+    loop.scan(Sample(np.zeros(2), np.array([0.1, 0.1])))
+    loop.set_mode(Mode.HOLD)
+    loop.set_mv([0.15, 0.1])
+    command = loop.scan(Sample(np.zeros(2), np.array([0.3, 0.4])))  # others have moved both
+    np.testing.assert_allclose(command.mv, [0.2, 0.4])  # the first goes on from there, by its largest move
+
+
 # --------------------------------------------------------------------------------------------------- elsewhere too long
 def test_a_stuck_actuator_is_out_after_a_while_until_an_operator_trusts_it(operated: Controller) -> None:
     loop = loop_of(operated, local_s=6.0)

@@ -178,3 +178,14 @@ def test_what_the_operator_sets_by_hand_as_a_shadow_ends_is_written(pi_file: Pat
     loop.set_mode(Mode.MANUAL)
     loop.set_mv([20.0])
     assert loop.scan(sample(mv=STANDS + 8)).mv.tolist() == [20.0]
+
+
+def test_a_way_by_hand_ends_where_the_mv_is_read_back_outside_its_range(pi_file: Path) -> None:
+    """A good sample without a read-back then tells nothing of where it stands."""
+    loop = loop_on(pi_file, mode=Mode.SHADOW)
+    loop.scan(sample())
+    loop.set_mode(Mode.MANUAL)
+    loop.set_mv([20.0])
+    assert not loop.scan(sample(mv=200.0)).writes
+    assert not loop.scan(sample(mv=None)).writes
+    assert loop.scan(sample(mv=STANDS + 8)).mv.tolist() == [STANDS + 8]

@@ -33,7 +33,7 @@ class CCompiler:
         for words in [named] if named else [[name] for name in COMPILERS]:
             found = shutil.which(words[0])
             if found:
-                return cls((found, *words[1:]))
+                return cls((str(Path(found).absolute()), *words[1:]))
         wanted = f"CC names {named[0]!r}, which is not there" if named else f"none of {', '.join(COMPILERS)} is there"
         raise HostError(f"no C compiler is installed: {wanted}; apt-get install gcc brings one")
 

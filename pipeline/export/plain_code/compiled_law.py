@@ -196,7 +196,8 @@ def _kept(key: str) -> bytes | None:
         content = path.read_bytes()
         library = content[_DIGEST_BYTES:]
         if hashlib.sha256(library).digest() == content[:_DIGEST_BYTES]:
-            path.touch()
+            with contextlib.suppress(OSError):  # a folder that is only read keeps its times
+                path.touch()
             return library
     return None
 

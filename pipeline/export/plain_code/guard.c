@@ -203,7 +203,7 @@ static void find(lower_loop *l, const lower_sample *s, int good_one)
     if (!(l->lost || l->taken || blind) || !(back || good_one)) {
         return;
     }
-    l->by_hand = l->by_hand && !(l->lost && back); /* it stays where it is found */
+    l->by_hand = l->by_hand && !(back && (l->lost || (l->taken && !sound))); /* it stays where it is found */
     l->known = back ? sound : l->known;
     l->lost = l->lost && back && !sound;
     l->taken = l->taken && back && !sound;

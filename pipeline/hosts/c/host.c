@@ -749,7 +749,7 @@ static void loop_found(Loop *l, const double *applied, bool good_one) {
   bool sound = applied && implausible(l->c, applied) == l->c->n_in[MV];
   bool blind = sound && l->by_hand && isnan(l->mv[0]); /* until now on a way by hand from nobody knows where */
   if (!(l->lost || l->taken || blind) || (!applied && !good_one)) return;
-  l->by_hand = l->by_hand && !(l->lost && applied); /* it stays where it is found */
+  l->by_hand = l->by_hand && !(applied && (l->lost || (l->taken && !sound))); /* it stays where it is found */
   l->lost = l->lost && applied && !sound;
   l->taken = l->taken && applied && !sound;
   if (sound) clip(l->c, applied, l->mv);

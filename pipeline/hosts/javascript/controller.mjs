@@ -390,7 +390,7 @@ export class Loop {
     const applied = given?.mv_applied, sound = applied && !this.#implausible(applied);
     const blind = sound && this.wanted && !this.mv; // until now on a way by hand from nobody knows where
     if (!(this.lost || this.taken || blind) || (!applied && reason)) return;
-    if (applied && this.lost) this.wanted = null; // it stays where it is found
+    if (applied && (this.lost || (this.taken && !sound))) this.wanted = null; // it stays where it is found
     if (applied) this.mv = sound ? this.#clipped(applied) : null;
     this.lost &&= Boolean(applied && !sound);
     this.taken &&= Boolean(applied && !sound);

@@ -33,7 +33,8 @@ class BoundedMinimum(nn.Module):
     the right side: a free one whose best lies beyond a bound, which it then keeps, or one at a bound whose best is
     inside. From sample to sample that set hardly differs, so that few changes reach the minimum. After a jump of a set
     point it does: with ``swept`` each entry first goes to its best within its bounds, from the last to the first.
-    Whatever the changes miss, the plan lies within its bounds. No branch, fixed cost.
+    Whatever the changes miss, the plan lies within its bounds; it may then cost more than the one before. No branch,
+    fixed cost.
 
     Source: principal pivoting of linear complementarity problems, Cottle, Pang and Stone, The Linear Complementarity
     Problem, chapter 4.

@@ -1,4 +1,4 @@
-"""A plan over a horizon: Gauss-Newton passes, each with a box QP by fixed sweeps."""
+"""A plan over a horizon: Gauss-Newton passes, each with a quadratic problem within bounds, at fixed cost."""
 
 from __future__ import annotations
 
