@@ -120,8 +120,8 @@ class AppliedMV:
         """Whether others had the MV until now, and no sample has told since where it stands."""
         return self._taken
 
-    def take(self, taken: bool = True) -> None:
-        """Others had the MV until now; or ``taken`` is false: somebody says where it goes."""
+    def take(self, taken: bool) -> None:
+        """``taken``: others had the MV until now."""
         self._taken = taken
 
     def untold(self, *, is_read: bool = False) -> str:

@@ -52,26 +52,20 @@ def apart(
     return found
 
 
-def with_factors_apart(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The model after ``apart``; itself where it has no such factor. ExportError where a shape is not static."""
-    values = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
+def static_shapes(model: onnx.ModelProto) -> dict[str, tuple[int, ...]]:
+    """Shape of each value but the constants. ExportError where one is not static."""
     inferred = onnx.shape_inference.infer_shapes(model, strict_mode=True).graph
     shapes = {}
-    for value in (*inferred.value_info, *inferred.output):
+    for value in (*inferred.input, *inferred.value_info, *inferred.output):
         lengths = [d.dim_value for d in value.type.tensor_type.shape.dim]
         if not all(lengths):
             raise ExportError(f"the graph's value {value.name} has no static shape; every shape must be one")
         shapes[value.name] = tuple(lengths)
-    new: dict[str, Array] = {}
+    return shapes
 
-    def constant(value: Array) -> str:
-        name = f"factor_{len(new)}"
-        new[name] = value
-        return name
 
-    nodes = apart(model.graph.node, values, shapes, constant)
-    if not new:
-        return model
+def with_nodes(model: onnx.ModelProto, nodes: list[onnx.NodeProto], new: Mapping[str, Array]) -> onnx.ModelProto:
+    """The model of other ``nodes``, with ``new`` constants by name behind those of the old ones that it still uses."""
     found = onnx.ModelProto()
     found.CopyFrom(model)
     del found.graph.node[:]
@@ -81,3 +75,17 @@ def with_factors_apart(model: onnx.ModelProto) -> onnx.ModelProto:
     del found.graph.initializer[:]
     found.graph.initializer.extend([*kept, *(numpy_helper.from_array(v, name) for name, v in new.items())])
     return found
+
+
+def with_factors_apart(model: onnx.ModelProto) -> onnx.ModelProto:
+    """The model after ``apart``; itself where it has no such factor. ExportError where a shape is not static."""
+    values = {i.name: numpy_helper.to_array(i) for i in model.graph.initializer}
+    new: dict[str, Array] = {}
+
+    def constant(value: Array) -> str:
+        name = f"factor_{len(new)}"
+        new[name] = value
+        return name
+
+    nodes = apart(model.graph.node, values, static_shapes(model), constant)
+    return with_nodes(model, nodes, new) if new else model

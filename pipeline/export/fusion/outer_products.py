@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import onnx
-from onnx import helper, shape_inference
+from onnx import helper
+
+from loopwright.pipeline.export.fusion.lone_factors import static_shapes, with_nodes
 
 TURNS = ("Reshape", "Transpose")
 
@@ -13,37 +15,20 @@ def without_turns(model: onnx.ModelProto) -> onnx.ModelProto:
 
     An outer product a' b + C, a step of an elimination, so takes one operator in place of two.
     """
-    made = {o: n for n in model.graph.node for o in n.output}
-    found = []
-    for node in model.graph.node:
-        turn = made.get(node.input[0]) if node.op_type == "Gemm" else None
-        if turn is not None and turn.op_type in TURNS and not _turned(node):
-            found.append((node, turn.input[0]))
-    if not found:
+    rows = {n.output[0]: n.input[0] for n in model.graph.node if n.op_type in TURNS}
+    columns = [n.output[0] for n in model.graph.node if n.op_type == "Gemm" and n.input[0] in rows and not _turned(n)]
+    if not columns:
         return model
-    inferred = shape_inference.infer_shapes(model, strict_mode=True, data_prop=True).graph
-    shapes = {
-        v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in (*inferred.value_info, *inferred.input)
-    }
-    done = onnx.ModelProto()
-    done.CopyFrom(model)
-    of = {node.output[0]: node for node in done.graph.node}
-    for node, row in found:
-        length = shapes.get(row, [])
-        if length[:1] == [1] and shapes.get(node.input[0]) == length[::-1]:
-            of[node.output[0]].input[0] = row
-            others = [a for a in node.attribute if a.name != "transA"]
-            del of[node.output[0]].attribute[:]
-            of[node.output[0]].attribute.extend([*others, helper.make_attribute("transA", 1)])
-    used = {name for node in done.graph.node for name in node.input} | {o.name for o in done.graph.output}
-    kept = [n for n in done.graph.node if n.op_type not in TURNS or n.output[0] in used]
-    del done.graph.node[:]
-    done.graph.node.extend(kept)
-    used = {name for node in kept for name in node.input}
-    constants = [i for i in done.graph.initializer if i.name in used]
-    del done.graph.initializer[:]
-    done.graph.initializer.extend(constants)
-    return done
+    shapes, nodes = static_shapes(model), []
+    for node in model.graph.node:
+        row = rows[node.input[0]] if node.output[0] in columns else ""
+        if len(shapes.get(row, ())) == 2 and shapes[row][0] == 1 and shapes[node.input[0]] == shapes[row][::-1]:
+            turned = {a.name: helper.get_attribute_value(a) for a in node.attribute} | {"transA": 1}
+            nodes.append(helper.make_node("Gemm", [row, *node.input[1:]], node.output, node.name, **turned))
+        else:
+            nodes.append(node)
+    used = {name for node in nodes for name in node.input} | {o.name for o in model.graph.output}
+    return with_nodes(model, [n for n in nodes if n.op_type not in TURNS or n.output[0] in used], {})
 
 
 def _turned(node: onnx.NodeProto) -> bool:
