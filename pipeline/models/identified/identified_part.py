@@ -23,10 +23,9 @@ from loopwright.pipeline.models.identified.model_validation import (
     foreseen,
     proof_figures,
     proven_answers,
-    sign_margin,
-    unused_answers,
 )
 from loopwright.pipeline.models.identified.network_search import UNITS
+from loopwright.pipeline.models.identified.open_answers import sign_margins
 from loopwright.pipeline.models.identified.output_error import Fitted, fit_starts, residuals
 from loopwright.pipeline.models.identified.parameter_uncertainty import colour_of, doubt_of, drawn
 from loopwright.pipeline.models.identified.residual_tests import residual_figures
@@ -154,9 +153,8 @@ class IdentifiedPart(Part):
         size = STEP_SDS * rows.v.std(axis=0)
         proven = proven_answers(curves, structure, problem.data, size, n_mv, cells, weights)
         n_cv = min(len(source.signals.sp), n_y)
-        controlled = {place: answer for place, answer in proven[0].items() if place[0] < n_cv}
-        unused = unused_answers(controlled, np.median(curves, axis=0) / size[:, None, None], structure, (n_cv, n_mv))
-        margin = sign_margin(controlled, unused, LIKELY_SDS) if n_mv > 1 else -np.inf
+        unit = np.median(curves, axis=0) / size[:, None, None]
+        margins = sign_margins(proven[0], unit, structure, n_cv, n_mv, LIKELY_SDS)
         doubt, colour = doubt_of(curves, n_mv), colour_of(found)
         # Where no dead time but the model's explains the record, nothing is known of others: the curves tell.
         compared = any(least < most for least, most in selection.dead_times)
@@ -201,7 +199,7 @@ class IdentifiedPart(Part):
             "gains": gain_table,
             **answers,
             "proof": _proof(searched, record, proven, runs, noise * scales.y_scale)
-            | ({"sign_margin": dict.fromkeys(names[:n_cv], margin)} if np.isfinite(margin) else {})
+            | ({"sign_margin": {names[i]: margin for i, margin in margins.items()}} if margins else {})
             | said
             | ({"held": dict(source.held)} if source.held else {}),
             "open": {name: values.tolist() for name, values in open_to.items()} | _likely(problem, selection, inputs),

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from loopwright.pipeline.models.identified.model_validation import MOST_OPEN, ProvenAnswer, sign_margin, unused_answers
+from loopwright.pipeline.models.identified.model_validation import ProvenAnswer
+from loopwright.pipeline.models.identified.open_answers import MOST_OPEN, sign_margin, sign_margins, unused_answers
 from loopwright.pipeline.models.identified.structure import Structure
 
 CERTAIN = ProvenAnswer(1.0, 0.9, 1.1, 1, 9, 1.0, 0.05)
@@ -101,3 +102,49 @@ def test_answers_that_nobody_uses_are_of_the_age_of_the_others() -> None:
     assert found[0, 0] == found[1, 1] == found[1, 0] == 0
     late = unused_answers(used, unit, replace(structure, delays=(0, 10)), (2, 2))
     assert late[0, 1] == pytest.approx(0.2 * slow[19:50].mean())
+
+
+# ----------------------------------------------------------------------------------------- variables with a range alone
+def margins_of(gains: np.ndarray, sd: dict[tuple[int, int], float], n_cv: int = 1) -> dict[int, float]:
+    """Of a plant whose answers have one age."""
+    n_mv = gains.shape[1]
+    structure = Structure("balanced", 1, (0,) * n_mv, (0,) * n_mv)
+    unit = np.repeat(gains.T[:, None, :], 20, axis=1)
+    return sign_margins(answers_of(gains, sd), unit, structure, n_cv, n_mv, 2.0)
+
+
+EVAPORATOR = np.array([[-1.04, 0.90, -0.015], [8.32, -5.32, -8.47], [-0.026, 0.458, -0.145]])
+
+
+def test_a_constraint_whose_main_answer_is_certain_stands_open_ones() -> None:
+    """A pressure that the steam moves; what feed and product do to it is open, and is nothing on the plant."""
+    open_ones = {(2, 0): 0.022, (2, 2): 0.30}
+    margins = margins_of(EVAPORATOR, open_ones)
+    assert margins[2] > 0.25
+    assert margins[1] == 1.0
+
+
+def test_a_constraint_whose_main_answer_is_open_is_worth_nothing() -> None:
+    """Then the law would push the wrong way at its limit."""
+    assert margins_of(EVAPORATOR, {(2, 1): 0.4})[2] < 0
+
+
+def test_a_constraint_stands_no_answer_that_is_worth_something_only_beside_the_set_points() -> None:
+    """Operators may take the others out: alone its loop would run away on a plant that the record leaves open."""
+    gains = np.array([[1.0, 1.0], [0.1, 1.0]])
+    wide = {(1, 1): 2.0}
+    alone = sign_margin({(0, j): a for (i, j), a in answers_of(gains, wide).items() if i == 1}, np.zeros((1, 2)), 2.0)
+    assert margins_of(gains, wide)[1] <= alone < 0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_variables_with_set_points_have_the_margin_of_them_all_whatever_constraints_do(seed: int) -> None:
+    gains = np.random.default_rng(seed).normal(size=(3, 3)) + 2 * np.eye(3)
+    sd = {(0, 1): 1.0, (1, 0): 1.0, (2, 0): 1.0}
+    controlled = {place: answer for place, answer in answers_of(gains, sd).items() if place[0] < 2}
+    margins = margins_of(gains, sd, n_cv=2)
+    assert margins[0] == margins[1] == pytest.approx(sign_margin(controlled, np.zeros((2, 3)), 2.0))
+
+
+def test_with_one_mv_nothing_outweighs_an_open_answer() -> None:
+    assert margins_of(np.array([[1.0], [0.5]]), {(1, 0): 0.5}) == {}
