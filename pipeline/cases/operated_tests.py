@@ -230,11 +230,13 @@ class _Made:
         (x, mv0), n = plant.start, 2 * self.reach.hold
         settling = [i for i in range(len(self.pvs)) if i not in self.reach.integrates]
         y0, best = plant.measure(x), None
+        down, up = self._room(y0)
         for j, s in enumerate(self.mvs):
             room = s.high - mv0[j] if s.high - mv0[j] > mv0[j] - s.low else s.low - mv0[j]
             moved = np.array(mv0, dtype=np.float64)
             moved[j] += AT_ODDS * room
-            way = courses(plant, x, moved[None], n)[0, -1] - y0
+            # The range of the first rank must begin before the other end of what operators allow by default.
+            way = np.clip(courses(plant, x, moved[None], n)[0, -1] - y0, -down, up)
             for a in settling:
                 for b in settling:
                     clear = min(abs(way[a]) / self.least_half[a], abs(way[b]) / self.least_half[b])
@@ -282,6 +284,12 @@ class _Made:
             values[f"{name}.low"] = self._within(name, "low", float(middle[i] - half[i]))
             values[f"{name}.high"] = self._within(name, "high", float(middle[i] + half[i]))
         return values
+
+    def _room(self, y: Array) -> tuple[Array, Array]:
+        """How far PVs (n_y,) may go down and up from ``y`` and be a range's width from the ends of their defaults."""
+        low, high = (np.array([self.places[f"{s.name}.{end}"].default for s in self.pvs]) for end in ("low", "high"))
+        width = 2 * self.least_half
+        return np.maximum(y - low - width, 0.0), np.maximum(high - width - y, 0.0)
 
     def _within(self, signal: str, what: str, value: float) -> float:
         """A value within its engineered range, in digits that a person would set."""

@@ -92,6 +92,26 @@ def test_ranges_at_odds_cannot_both_be_kept_and_the_last_rank_bears_it() -> None
         assert wrong.borne == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("noises", [3.0, 12.0, 48.0])
+@pytest.mark.parametrize("aside", [-0.9, 0.0, 0.9])
+def test_every_test_is_one_that_the_law_takes_within_narrow_ranges_of_its_own(noises: float, aside: float) -> None:
+    """An evaporator's level has a default high end: a test had asked for a low end beyond it, and no controller came."""
+    case = two_lags()
+    signals, half = case.plant.pv_signals, noises * case.noise_std
+    middle = case.plant.measure(case.plant.start[0]) + aside * half
+    own = {
+        f"{s.name}.{end}": float(np.clip(middle[i] + by * half[i], s.low, s.high))
+        for i, s in enumerate(signals)
+        for end, by in (("low", -1), ("high", 1))
+    }
+    narrow = entries_of(case.plant.signals, len(signals), [], [], own)
+    tests = operated_tests(case, narrow, {})
+    assert {"taken_out", "costs"} <= set(tests)
+    for test in tests.values():
+        for one in test.sequences:
+            one.operated(narrow)
+
+
 def test_the_optimum_gains_all_and_the_start_nothing_and_a_wrong_way_loses() -> None:
     case = two_lags()
     test = operated_tests(case, entries(case), {})["costs"].sequences[0]
