@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.export.plain_code.compiled_law import law_stepping
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.identified import StateEquation
@@ -20,6 +21,7 @@ from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving import Controller, EndpointError, Guard, Mode, Sample, SampleError, Signal
 from loopwright.serving.guard import READ_BACK_MARGIN
 from loopwright.serving.operating import Operate
+from loopwright.serving.vectorized_controller import ComputeRows
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -129,11 +131,25 @@ class Findings:
         self.first.setdefault(name, f"scan {self.scan}: {name} {words}")
 
 
-class Watched(Controller):
-    """A controller whose steps are looked at: what it was given, and what it gave."""
+class RowSession:
+    """A session's place taken by the compiled plain C, on the buffers that the controller bound."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, compute: ComputeRows, given: Array, taken: Array) -> None:
+        self.compute, self.given, self.taken = compute, given.reshape(1, -1), taken
+
+    def run_with_iobinding(self, _binding: Any) -> None:
+        """One step."""
+        self.taken[:] = self.compute(self.given)[0]
+
+
+class Watched(Controller):
+    """A controller whose steps are looked at: what it was given, and what it gave; ``law_by`` as of ``stress``."""
+
+    def __init__(self, path: Path, law_by: str = "onnx") -> None:
         super().__init__(path)
+        compute = law_stepping(Controller(path), law_by).compute  # over the conformance kit as the session computes it
+        if compute is not None:
+            self._session = RowSession(compute, self._in, self._out)
         self.findings = Findings()
         m = self.manifest
         self.low, self.high = np.array([s.low for s in m.mv]), np.array([s.high for s in m.mv])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -49,6 +51,19 @@ def test_nothing_is_wrong_in_a_few_histories_and_all_of_it_happens_there(
 def test_a_history_is_the_same_again(fuzz: SimpleNamespace, laws: Callable[[int], Sequence[Any]]) -> None:
     first, again = (fuzz.operate_fuzz.History(KINDS[0], laws).run() for _ in range(2))
     assert (first.seen, first.faults) == (again.seen, again.faults)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler (Debian: apt install gcc)")
+def test_compiled_laws_make_the_same_history(
+    fuzz: SimpleNamespace, laws: Callable[[int], Sequence[Any]], tmp_path: Path
+) -> None:
+    for file in laws(KINDS[0]):
+        shutil.copy(file.path, tmp_path)
+        shutil.copy(file.path.with_suffix(".json"), tmp_path)
+    compiled = fuzz.operate_fuzz.opened(tmp_path, "c")
+    assert all(isinstance(law._session, fuzz._fuzzed_plants.RowSession) for law in compiled(KINDS[0]))
+    one, other = (fuzz.operate_fuzz.History(KINDS[0], by).run() for by in (laws, compiled))
+    assert (one.seen, one.faults, one.wrong) == (other.seen, other.faults, other.wrong)
 
 
 def test_an_mv_that_leaves_its_range_or_its_rate_is_counted(

@@ -7,9 +7,12 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from identified_models import made_signals
 from scipy.optimize import lsq_linear
 
+from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.laws.predictive.bounded_minimum import PLAN_RIDGE, BoundedMinimum
+from loopwright.pipeline.laws.predictive.predictive import Predictive
 
 Problem = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 seeds = st.integers(0, 2**16)
@@ -115,3 +118,14 @@ def test_the_ridge_keeps_a_plan_where_several_cost_the_same() -> None:
     h = np.array([[1.0, 1.0], [1.0, 1.0]])
     z = found((h, np.array([0.4, 0.4]), np.array([0.5, -0.5]), -np.ones(2), np.ones(2)), 4)
     np.testing.assert_allclose([z.sum(), z[0] - z[1]], [0.4, 1.0], atol=0.02)
+
+
+def test_what_would_have_no_effect_is_refused() -> None:
+    with pytest.raises(ValueError, match="sweeps"):
+        Predictive.Params(sweeps=8, operate={})
+    with pytest.raises(ValueError, match="changes"):
+        Predictive.Params(changes=3)
+    assert Predictive.Params(changes=0, operate={}).changes == 0
+    params = Predictive.Params(cv_low=(-0.5,), operate={"y0.low": -0.2})
+    with pytest.raises(LawError, match="cv_low"):
+        Predictive.check_settings(params, made_signals(1, 1))

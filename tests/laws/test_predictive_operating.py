@@ -81,7 +81,8 @@ def test_by_default_the_law_does_what_it_does_without(seed: int, sizes: tuple[in
     signals = made_signals(n_y, n_mv)
     far = tuple(replace(s, low=-1e3, high=1e3) for s in signals.pv)  # no plan comes near the ends
     signals = Signals(1.0, far, far, signals.dv, signals.mv)
-    laws = [Predictive(signals, model, Predictive.Params(horizon=20, sweeps=60, operate=o)).eval() for o in (None, {})]
+    ended = Predictive.Params(horizon=20, sweeps=60), Predictive.Params(horizon=20, operate={})
+    laws = [Predictive(signals, model, params).eval() for params in ended]
     plain, own = (closed(law, model, sp, noise=0.01) for law in laws)
     np.testing.assert_allclose(own[1], plain[1], atol=0.05)  # of half a range; of laws with 4 sweeps up to .17
 

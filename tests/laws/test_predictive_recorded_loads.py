@@ -110,7 +110,7 @@ def test_a_search_moves_laws_with_the_loads_that_they_will_have(monkeypatch: pyt
         return tuning.TunedLaw(dict(start), damping, ())
 
     monkeypatch.setattr(tuning, "tuned", stands)
-    params = Predictive.Params(operate={}, tuning="search")
+    params = Predictive.Params(operate={}, changes=3, tuning="search")
     found = tuning.searched_params(tried.append, recorded(), made_signals(2, 2), params, 12)
     assert [(p.operate, p.loads) for p in tried] == [(None, "record")]
     assert found.params.operate == {}

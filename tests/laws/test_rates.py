@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from identified_models import made_signals, random_model
+from predictive_loops import closed
 
 from loopwright.pipeline.config.params import parse
 from loopwright.pipeline.errors import LawError, ParamsError
@@ -20,6 +21,7 @@ from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.plants.simulator import Signals
 from loopwright.serving.card import card
 from loopwright.serving.controller import Controller
+from loopwright.serving.operating import Operate
 
 
 def slow(*moves: float | None) -> Signals:
@@ -76,3 +78,24 @@ def test_a_file_keeps_the_limit_of_one_mv_and_says_it(tmp_path: Path) -> None:
         moved = np.maximum(moved, np.abs(mv - before))
     assert moved[0] == pytest.approx(0.05)
     assert moved[1] > 0.1
+
+
+@pytest.mark.parametrize("max_move", [None, 0.3])
+def test_a_rate_of_the_law_is_planned_with_and_the_most_that_operators_may_give(max_move: float | None) -> None:
+    signals, model = made_signals(2, 2), random_model(1, n_y=2, n_mv=2)
+    signals = replace(signals, mv=tuple(replace(s, max_move=max_move) for s in signals.mv))
+    as_plant = replace(signals, mv=tuple(replace(s, max_move=r) for s, r in zip(signals.mv, (0.05, 0.1), strict=True)))
+    params = Predictive.Params(horizon=20, operate={})
+    of_law, of_plant = (
+        Predictive(given, model, p).eval()
+        for given, p in ((signals, replace(params, mv_rate=(0.05, 0.1))), (as_plant, params))
+    )
+    sp = np.full((30, 2), 0.4)
+    for one, other in zip(closed(of_law, model, sp), closed(of_plant, model, sp), strict=True):
+        np.testing.assert_array_equal(one, other)
+    operate = Operate(of_law.operate)
+    assert [operate.entries[operate.places[f"{s.name}.max_move"]].high for s in signals.mv] == [0.05, 0.1]
+    with pytest.raises(LawError, match="max_move"):
+        Predictive.check_settings(
+            replace(params, mv_rate=0.05, operate={f"{signals.mv[0].name}.max_move": 0.2}), signals
+        )

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from loopwright.pipeline.config.operator_defaults import MOST_COST, MOST_RANKS
 from loopwright.pipeline.errors import LawError
-from loopwright.pipeline.laws.base import hold_numbers
+from loopwright.pipeline.laws.base import Rates, hold_numbers, rates_of
 from loopwright.pipeline.laws.predictive.horizon import Moves
 from loopwright.pipeline.laws.predictive.qp_solver import OperatedPlan
 from loopwright.pipeline.laws.predictive.soft_limits import PRICE
@@ -47,12 +47,14 @@ def entries_of(
     cv_low: Sequence[float | None],
     cv_high: Sequence[float | None],
     defaults: Mapping[str, float],
+    mv_rate: Rates = None,
 ) -> tuple[OperateEntry, ...]:
     """The entries of ``operate`` of a law whose first ``outputs`` PVs have ranges; those with set points stand first.
 
     By default all is as without ``operate``: every signal in use, set points tracked, ranges from ``cv_low`` to
     ``cv_high`` [pv], or as wide as the signals' where these are None or too few, no resting values, no costs; and then
-    ``defaults`` by name, in engineering units. LawError for an unknown name or a default that operators may not set.
+    ``defaults`` by name, in engineering units. No MV moves faster than ``mv_rate`` [mv]. LawError for an unknown name,
+    a default that operators may not set, or a limit given twice.
     """
     found = []
     both = {s.name for s in signals.pv[:outputs]} & {s.name for s in signals.mv}
@@ -73,12 +75,19 @@ def entries_of(
         least, most = (LEAST_WEIGHT, MOST_WEIGHT) if tracked else (1.0, 1.0)  # without a set point it has no meaning
         add("cv", s, "weight", 1.0, least, most)
         low, high = (of[i] if i < len(of) else None for of in (cv_low, cv_high))
+        for end, limit in (("low", low), ("high", high)):
+            if limit is not None and f"{s.name}.{end}" in defaults:
+                raise LawError(
+                    f"law 'predictive': cv_{end} gives {limit} for {s.name}, and operate {s.name}.{end} = "
+                    f"{defaults[f'{s.name}.{end}']}; leave one of them out"
+                )
         add("cv", s, "low", s.low if low is None else low, s.low, s.high, s.unit)
         add("cv", s, "high", s.high if high is None else high, s.low, s.high, s.unit)
         add("cv", s, "rank", float(USUAL_RANK), 1.0, float(MOST_RANKS))
         add("cv", s, "cost", 0.0, -MOST_COST, MOST_COST, f"1/{s.unit}")
-    for s in signals.mv:
-        fastest = min(s.max_move or s.high - s.low, s.high - s.low)
+    rates = rates_of(signals, mv_rate) or (math.inf for _ in signals.mv)
+    for s, rate in zip(signals.mv, rates, strict=False):
+        fastest = min(rate, s.high - s.low)
         add("mv", s, "use", 1.0, 0.0, 1.0)
         add("mv", s, "low", s.low, s.low, s.high, s.unit)
         add("mv", s, "high", s.high, s.low, s.high, s.unit)

@@ -16,6 +16,8 @@ from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Array, Signals
 
 LONGEST_HORIZON = 500  # samples of a horizon: the law's graph and its design grow with each
+USUAL_SWEEPS = 4  # of each quadratic problem of a law without `operate`
+USUAL_CHANGES = 2  # of what lies at a bound, of a law with `operate`
 Limits = tuple[float | None, ...] | None
 
 
@@ -35,19 +37,19 @@ class PredictiveParams:
     there are as many as outputs, or else on the ``outputs``; ``record``: on the outputs, and each changes
     as much as in the record; None: ``record`` of a law with ``operate`` whose model was identified with its
     loads, else ``mvs``.
-    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; with ``operate`` each takes ``changes``, 0 or more,
-    of what lies at a bound in place of sweeps. ``damping`` kappa of a pass, 0 or more; None: .5 of one MV, .25 of
-    several, and with a search the least that the loops stand. ``tuning``: ``given`` takes these numbers, ``search``
-    starts from them and chooses speed, caution, horizon and jumps in closed loops over the model with errors and loads,
-    drawn by ``seed``. ``mv_rate`` [mv]: largest MV change a sample, which the plan knows, one number or one for each
-    MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
+    ``passes`` of Gauss-Newton and ``sweeps`` of each QP, 1 or more; None: 4. With ``operate`` each takes ``changes``, 0
+    or more, of what lies at a bound in place of sweeps; None: 2. ``damping`` kappa of a pass, 0 or more; None: .5 of
+    one MV, .25 of several, and with a search the least that the loops stand. ``tuning``: ``given`` takes these numbers,
+    ``search`` starts from them and chooses speed, caution, horizon and jumps in closed loops over the model with errors
+    and loads, drawn by ``seed``. ``mv_rate`` [mv]: largest MV change a sample, which the plan knows, one number or one
+    for each MV; None: that of the plant. ``cv_low`` and ``cv_high`` [pv]: soft limits, one a CV, None where a CV has
     none; None: no limits. A set point beyond a limit counts as one at the limit. ``preview`` of the set points:
     ``held``, as they are now; ``ramp``, their last slope goes on, as in a recipe of ramps; ``course``, as the input
-    ``ahead`` gives them at each sample, steps to come and forecasts of measured disturbances included, and as now
-    where nothing is given.
-    ``operate``: other defaults, by name, of the numbers that operators change while the law runs, as ``TIC-1.low`` or
-    ``valve.rest``, and may be empty: the law then reads these numbers and which readings are fresh, and soft limits
-    are the defaults of its ranges; None: it has none of this.
+    ``ahead`` gives them at each sample, steps to come and forecasts of measured disturbances included, and as now where
+    nothing is given. ``operate``: other defaults, by name, of the numbers that operators change while the law runs, as
+    ``TIC-1.low`` or ``valve.rest``, and may be empty: the law then reads these numbers and which readings are fresh,
+    soft limits are the defaults of its ranges, and no operator lets an MV move faster than ``mv_rate``; None: it has
+    none of this.
     """
 
     speed: float = 1.0
@@ -63,8 +65,8 @@ class PredictiveParams:
     loads: Literal["mvs", "outputs", "record"] | None = None
     damping: float | None = None
     passes: int = 2
-    sweeps: int = 4
-    changes: int = 2
+    sweeps: int | None = None
+    changes: int | None = None
     tuning: Literal["given", "search"] = "given"
     seed: int = 0
     mv_rate: Rates = None
@@ -93,6 +95,7 @@ class PredictiveParams:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} is {value}; it must be at least {least}")
+        self._refuse_idle()
         if self.horizon is not None and self.horizon > LONGEST_HORIZON:
             raise ValueError(
                 f"horizon is {self.horizon}; give 8 to {LONGEST_HORIZON} samples, or leave it out: 50 or fewer suffice "
@@ -105,6 +108,15 @@ class PredictiveParams:
                 raise ValueError(
                     f"cv_low[{i}] is {low} and cv_high[{i}] {high}; a low limit must be below the high one"
                 )
+
+    def _refuse_idle(self) -> None:
+        """ValueError for a number that the law would never read."""
+        if self.operate is None and self.changes is not None:
+            raise ValueError("changes has no effect without `operate`: leave it out, or give sweeps")
+        if self.operate is not None and self.sweeps is not None:
+            raise ValueError(
+                "sweeps has no effect with `operate`: leave it out, or give changes, of what lies at a bound"
+            )
 
 
 def weights_of(signals: Signals, params: PredictiveParams) -> tuple[float, ...]:

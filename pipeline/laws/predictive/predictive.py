@@ -19,6 +19,8 @@ from loopwright.pipeline.laws.predictive.known_future import KnownFuture, ahead_
 from loopwright.pipeline.laws.predictive.observer import Noises, Observer, StateEstimate, load_variance
 from loopwright.pipeline.laws.predictive.operating import OperateScales, Operation, entries_of
 from loopwright.pipeline.laws.predictive.params import (
+    USUAL_CHANGES,
+    USUAL_SWEEPS,
     PredictiveParams,
     check_sizes,
     limits_of,
@@ -116,10 +118,10 @@ class Predictive(ControlLaw):
         bounds = scaled_limits(signals, model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
-        bounded = None if params.operate is None else BoundedMinimum(self.moves.count, params.changes)
-        self.planner = Planner(
-            run, self.moves, cost, params.passes, params.sweeps, rate, walls, bounded, valleys=n_mv > n_cv
-        )
+        changes = USUAL_CHANGES if params.changes is None else params.changes
+        bounded = None if params.operate is None else BoundedMinimum(self.moves.count, changes)
+        sweeps = USUAL_SWEEPS if params.sweeps is None else params.sweeps
+        self.planner = Planner(run, self.moves, cost, params.passes, sweeps, rate, walls, bounded, valleys=n_mv > n_cv)
         self.wanted = course_of(signals, model, horizon, n_o, bounds, ramp=params.preview == "ramp")
         self.ahead = ahead_of(signals, horizon) if given else None
         self.known = None if self.ahead is None else KnownFuture(self.ahead, model, n_o)
@@ -142,7 +144,7 @@ class Predictive(ControlLaw):
         """The entries of ``operate``, their defaults, and the way from them to a plan."""
         low, high = (getattr(params, end) or (None,) * len(self.signals.sp) for end in ("cv_low", "cv_high"))
         limits_of(self.signals, params)  # raises
-        self.operate = entries_of(self.signals, n_o, low, high, params.operate or {})
+        self.operate = entries_of(self.signals, n_o, low, high, params.operate or {}, params.mv_rate)
         scales = OperateScales(model.y_center[:n_o], model.y_scale[:n_o], middle, half)
         self.operation = Operation(self.operate, scales, self.moves, most_weight)
         self.register_buffer("same", 2 * READ_BACK_MARGIN * half)
@@ -257,7 +259,8 @@ class Predictive(ControlLaw):
         weights_of(signals, params)
         limits_of(signals, params)
         if params.operate is not None:
-            entries_of(signals, len(signals.pv), params.cv_low or (), params.cv_high or (), params.operate)
+            ends = (params.cv_low or (), params.cv_high or ())
+            entries_of(signals, len(signals.pv), *ends, params.operate, params.mv_rate)
 
     def forward(
         self,

@@ -192,7 +192,7 @@ def searched_params(
     ``CALM_SPEED`` of the speed and ``CALM_JUMPS`` of the jumps.
     """
     loads = loads_at(model, params)  # without `operate` the laws of the search would have others
-    plain = replace(params, cv_low=None, cv_high=None, preview="held", operate=None, loads=loads)
+    plain = replace(params, cv_low=None, cv_high=None, preview="held", operate=None, changes=None, loads=loads)
 
     def with_numbers(n: Mapping[str, float], damping: float | None, given: PredictiveParams) -> PredictiveParams:
         numbers: dict[str, Any] = {**n, "horizon": int(n["horizon"]), "damping": damping}
