@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.serving.certificate import CERTIFICATE, certified
+from loopwright.serving.certificate import CERTIFICATE, certificate_of
 from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.loop import WARM_LEAD_S
@@ -78,7 +78,7 @@ def card_json(controller: Controller) -> str:
 
 def _certificate(controller: Controller) -> list[str]:
     """The certificate's sentence and what it rests on; nothing without one."""
-    read = certified(controller)
+    read = certificate_of(controller.manifest, controller.law_sha256)
     if read.wrong:
         return ["", f"certificate: NOT TO BE BELIEVED, {read.wrong}"]
     return ["", "certificate", *(f"  {line}" for line in read.lines)] if read.certificate else []

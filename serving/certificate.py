@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from loopwright.serving.controller import Controller
 from loopwright.serving.errors import ArtifactError
 from loopwright.serving.fields import parse
 from loopwright.serving.manifest import Manifest
@@ -29,8 +28,8 @@ SHOWN_NAMES = 6  # parameters, failed loops or tests that a sentence names
 class CertifiedFamily:
     """The plants of a certificate, and what else of a loop was drawn.
 
-    ``parameters``: name -> lowest and highest value of all plants; ``plants`` are the plants that these belong to:
-    one in equations, or the models of a record. ``loads`` and ``noise`` are the lowest and highest share of those of
+    ``parameters``: name -> lowest and highest value of all plants; ``plants`` is the number of plants that these belong
+    to: those that the tests run on, of a record its models. ``loads`` and ``noise`` are the lowest and highest share of those of
     the tests, ``late`` the share of the loops with one more sample of dead time, ``faulty`` that of those with a fault
     of an actuator, one of ``faults``. ``held_out`` are the seeds of the tests' set points.
     """
@@ -57,7 +56,7 @@ class CertifiedFamily:
     def words(self) -> str:
         """What was drawn, in one line."""
         names = _some([f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in self.parameters.items()])
-        on = f"{self.plants} models of its record" if self.plants > 1 else "its plant"
+        on = f"the {self.plants} plants of its tests" if self.plants > 1 else "its plant"
         said = [on, _some(list(self.tests), "test")]
         said += [f"with {names}"] if self.parameters else []
         said += [f"loads {_span(self.loads)} those of the tests", f"noise {_span(self.noise)} the usual"]
@@ -122,19 +121,22 @@ class Certificate:
         return f"a loop that {_either([*self.fails_if, *limits])}"
 
     @property
-    def lines(self) -> tuple[str, ...]:
-        """The sentence, and what it rests on, a line each."""
-        found = [
-            self.sentence,
+    def grounds(self) -> tuple[str, ...]:
+        """What the sentence rests on, a line each: what a failure is, what was drawn, and what was not."""
+        return (
             f"a failure: {self.failure_words}",
             f"the family: {self.family.words}",
             f"not in the family: {'; '.join(self.family.without) or 'not said'}",
-        ]
-        if self.failed:
-            rest = self.failures - min(len(self.failed), SHOWN_NAMES)
-            shown = [f"{loop} ({', '.join(how)})" for loop, how in list(self.failed.items())[:SHOWN_NAMES]]
-            found.append(f"failed loops: {', '.join(shown)}" + f", and {rest} more" * bool(rest))
-        return tuple(found)
+        )
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """The sentence, what it rests on, and the first failed loops, a line each."""
+        if not self.failed:
+            return (self.sentence, *self.grounds)
+        rest = self.failures - min(len(self.failed), SHOWN_NAMES)
+        shown = [f"{loop} ({', '.join(how)})" for loop, how in list(self.failed.items())[:SHOWN_NAMES]]
+        return (self.sentence, *self.grounds, f"failed loops: {', '.join(shown)}" + f", and {rest} more" * bool(rest))
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready values, as they stand in the evidence."""
@@ -160,7 +162,7 @@ class CertificateRead:
 
 
 def certificate_of(manifest: Manifest, law: str) -> CertificateRead:
-    """The certificate in a manifest whose law has the digest ``law``."""
+    """The certificate in a manifest whose law has the digest ``law`` (``Controller.law_sha256``)."""
     tree = manifest.evidence.get(CERTIFICATE)
     if tree is None:
         return CertificateRead(None)
@@ -173,11 +175,6 @@ def certificate_of(manifest: Manifest, law: str) -> CertificateRead:
             None, f"it is that of another law ({found.law[:16]}...), and says nothing of this one: certify this file"
         )
     return CertificateRead(found)
-
-
-def certified(controller: Controller) -> CertificateRead:
-    """The certificate of a controller's file."""
-    return certificate_of(controller.manifest, controller.law_sha256)
 
 
 def failures_probability(failures: int, loops: int, share: float) -> float:

@@ -63,6 +63,12 @@ def law_digest(data: bytes, manifest: str) -> str:
     return hashlib.sha256(hashlib.sha256(graph).digest() + text.encode()).hexdigest()
 
 
+def law_in(data: bytes) -> str:
+    """The law's digest of a controller's file; ArtifactError where it is none, or was changed after its export."""
+    unseal(data)
+    return law_digest(data, audit.audit(data).metadata.get(MANIFEST_KEY, ""))
+
+
 def _metadata_entry(key: str, value: str) -> bytes:
     """An entry of ModelProto.metadata_props as protobuf writes it."""
     texts = ((b"\x0a", key.encode()), (b"\x12", value.encode()))

@@ -30,7 +30,7 @@ from loopwright.pipeline.export.controller_file import with_evidence
 from loopwright.pipeline.export.plain_code.compiled_law import LAW_BY, law_stepping
 from loopwright.pipeline.files import read_json, write_json
 from loopwright.pipeline.report.stress import replay_loop
-from loopwright.serving.certificate import CERTIFICATE, Certificate, certified
+from loopwright.serving.certificate import CERTIFICATE, Certificate, certificate_of
 from loopwright.serving.controller import Controller
 
 CERTIFIED_LOOPS = loops_without_failure(0.01, 0.99)
@@ -70,6 +70,9 @@ def run(options: argparse.Namespace) -> None:
     if options.replay is not None:
         _replay(options, controller, content, case, out)
         return
+    target = out / options.file.name
+    if target.resolve() == options.file.resolve():
+        raise ParamsError(f"{target} is the file itself, and the certified file is a copy; name a folder by --out")
     plan = CertificatePlan(controller.law_sha256, *_asked(options, case))
     stepping = law_stepping(controller, options.law_by)
     _write_plan(plan, controller, out)
@@ -81,7 +84,6 @@ def run(options: argparse.Namespace) -> None:
     outcomes = outcomes_of(stress, plan.params.loops, options.batch, options.workers, "certify: batches of loops")
     taken = time.perf_counter() - begun
     found = plan.certificate(outcomes, stepping.words)
-    target = out / options.file.name
     with_evidence(options.file, target, {**controller.manifest.evidence, CERTIFICATE: found.to_dict()})
     every = {str(o.index): list(how) for o in outcomes if (how := plan.failures(o))}
     write_json(out / RESULT_FILE, {**found.to_dict(), "failed": every, "replay": _replay_command(target, "K")})
@@ -148,7 +150,7 @@ def _replay(options: argparse.Namespace, controller: Controller, content: bytes,
 
 def _certificate_in(controller: Controller) -> Certificate:
     """The certificate of a file; ParamsError where there is none to believe."""
-    read = certified(controller)
+    read = certificate_of(controller.manifest, controller.law_sha256)
     if read.certificate is None:
         why = f"its certificate counts for nothing: {read.wrong}" if read.wrong else "it holds no certificate"
         raise ParamsError(f"{controller.path}: {why}; give the file that `loopwright certify` wrote")

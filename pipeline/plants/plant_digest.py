@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import inspect
 import textwrap
 
 import numpy as np
 
+from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.files import digest
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.identified import IdentifiedPlant
@@ -17,12 +19,14 @@ from loopwright.pipeline.plants.simulator import Simulator
 def plant_digest(plant: Simulator) -> str:
     """sha256 of a plant of any kind, its parameters among the rest.
 
-    A class of a user's own counts by its text where Python can read it, else by its name.
+    A class of another kind counts by its text where Python can read it, else by its name; so does one in equations
+    whose discrete MV has no relaxation.
     """
     if isinstance(plant, IdentifiedPlant):
         return identified_digest(plant)
     if isinstance(plant, EquationPlant):
-        return equations_digest(plant)
+        with contextlib.suppress(PlantError):
+            return equations_digest(plant)
     try:
         text = ast.unparse(ast.parse(textwrap.dedent(inspect.getsource(type(plant)))))
     except (OSError, TypeError):

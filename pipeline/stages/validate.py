@@ -60,7 +60,7 @@ from loopwright.pipeline.stages.paths import (
     step_time_file,
     validation_folder,
 )
-from loopwright.serving.certificate import CERTIFICATE
+from loopwright.serving.certificate import CERTIFICATE, Certificate
 from loopwright.serving.controller import Controller, runtime_version
 from loopwright.serving.controller_file import controller_files
 
@@ -142,6 +142,9 @@ def validate(name: str) -> None:
     if metrics.poor:
         why, _, remedy = metrics.poor.rpartition("; ")
         withheld = f"controllers.{name} {why}, {NOTHING}; {remedy}"
+    if not (refused or params.name == case.old_loop):
+        certificate = _certified(case, choices.certificate, source, folder / "certificate_plan.json", name)
+        metrics = replace(metrics, certificate=certificate)
     metrics.write(folder / "metrics.json")
     took = step_us(Controller(source), next(iter(shipped.curves.values())), case.plant.dv_nominal)
     write_json(step_time_file(params.case, params.name), took)
@@ -169,8 +172,8 @@ def validate(name: str) -> None:
         evidence["operated"] = {test: result.figures() for test, result in operated.items()}
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
-    if not (refused or params.name == case.old_loop):
-        evidence |= _certified(case, choices.certificate, source, folder / "certificate_plan.json", name)
+    if metrics.certificate is not None:
+        evidence[CERTIFICATE] = metrics.certificate.to_dict()
     target = ARTIFACTS / params.case / f"{params.name}.onnx"
     if params.name == case.old_loop:
         withhold(target, RIVAL)
@@ -327,24 +330,24 @@ def _over_seeds(rows: Mapping[int, Metrics]) -> OverSeeds:
     return OverSeeds(median, low, high, {str(seed): row for seed, row in rows.items()})
 
 
-def _certified(case: Case, asked: CertificateParams, file: Path, written: Path, name: str) -> dict[str, Any]:
-    """The entry of a file's certificate in its evidence, whose plan is ``written`` before its first loop runs.
+def _certified(case: Case, asked: CertificateParams, file: Path, written: Path, name: str) -> Certificate | None:
+    """The certificate of a file, whose plan is ``written`` before its first loop runs.
 
-    Empty where none is asked for, or no other plant can be drawn.
+    None where none is asked for, or no other plant can be drawn.
     """
     if not asked.loops:
-        return {}
+        return None
     controller, content = opened(file)
     try:
         plan = CertificatePlan(controller.law_sha256, case, asked)
     except PlantError as error:
         print(f"validate {name}: no certificate: {error}", file=sys.stderr)
-        return {}
+        return None
     write_json(written, plan.record())
     outcomes = outcomes_of(Stress(plan.drawing(), content), asked.loops, label=f"validate {name}: certificate")
     found = plan.certificate(outcomes, f"onnxruntime {runtime_version()}")
     print(f"validate {name}: {found.sentence}", file=sys.stderr)
-    return {CERTIFICATE: found.to_dict()}
+    return found
 
 
 def _evidence(case: Case, base: list[Trial], shipped: Trial, grounds: Grounds | None) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from loopwright.serving.bridging import BRIDGE_PERIODS
-from loopwright.serving.certificate import certified
+from loopwright.serving.certificate import certificate_of
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample
@@ -251,7 +251,7 @@ def _card(controller: Controller) -> View:
     m, evidence = controller.manifest, controller.manifest.evidence
     scenarios = evidence.get("scenarios")
     rows = scenarios if isinstance(scenarios, dict) else {}
-    signed, certificate = signer(controller), certified(controller)
+    signed, certificate = signer(controller), certificate_of(m, controller.law_sha256)
     found = {
         "law": m.law,
         "case": m.case,

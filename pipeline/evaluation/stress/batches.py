@@ -22,7 +22,7 @@ def outcomes_of(
 ) -> list[StressOutcome]:
     """Outcomes of the loops 0 to ``plants`` - 1, in order, on the engine: its cluster, or ``workers`` of this machine.
 
-    ``label`` (``STAGE: WHAT``) names the progress. None of ``batch``, ``workers`` and the cluster changes a bit of them.
+    ``label`` (``STAGE: WHAT``) names the progress. Neither ``batch`` nor the number of workers changes a bit of them.
     """
     here = address() is None
     wanted = workers or (1 if not here or plants <= FEW else os.cpu_count() or 1)
