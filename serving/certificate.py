@@ -29,9 +29,11 @@ class CertifiedFamily:
     """The plants of a certificate, and what else of a loop was drawn.
 
     ``parameters``: name -> lowest and highest value of all plants; ``plants`` is the number of plants that these belong
-    to: those that the tests run on, of a record its models. ``loads`` and ``noise`` are the lowest and highest share of those of
-    the tests, ``late`` the share of the loops with one more sample of dead time, ``faulty`` that of those with a fault
-    of an actuator, one of ``faults``. ``held_out`` are the seeds of the tests' set points.
+    to: those that the tests run on, of a record its models. ``spread``: share of a value by which a parameter without a
+    stated range differs at most. ``loads`` and ``noise`` are the lowest and highest share of those of the tests,
+    ``late`` the share of the loops with one more sample of dead time, ``faulty`` that of those with a fault of an
+    actuator, one of ``faults``. ``held_out`` are the seeds of the tests' set points, ``without`` what was not drawn, in
+    words.
     """
 
     case: str
@@ -46,7 +48,7 @@ class CertifiedFamily:
     late: float
     faulty: float
     faults: tuple[str, ...]
-    without: tuple[str, ...] = ()  # what was not drawn, in words
+    without: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready values."""
@@ -54,7 +56,7 @@ class CertifiedFamily:
 
     @property
     def words(self) -> str:
-        """What was drawn, in one line."""
+        """The plants, tests, loads, noise and faults that were drawn, in one line."""
         names = _some([f"{name} {low:.4g} to {high:.4g}" for name, (low, high) in self.parameters.items()])
         on = f"the {self.plants} plants of its tests" if self.plants > 1 else "its plant"
         said = [on, _some(list(self.tests), "test")]
@@ -116,13 +118,13 @@ class Certificate:
 
     @property
     def failure_words(self) -> str:
-        """What counts as a failure."""
+        """The failures that count, in words."""
         limits = [f"has {name} above {value:.6g}" for name, value in self.limits.items()]
         return f"a loop that {_either([*self.fails_if, *limits])}"
 
     @property
     def grounds(self) -> tuple[str, ...]:
-        """What the sentence rests on, a line each: what a failure is, what was drawn, and what was not."""
+        """The grounds of the sentence, a line each: what a failure is, what was drawn, and what was not."""
         return (
             f"a failure: {self.failure_words}",
             f"the family: {self.family.words}",

@@ -1,4 +1,4 @@
-"""``loopwright certify``: a plan before the first loop, a certificate in the file, its loops again, and what it refuses."""
+"""``loopwright certify``: its plan before the first loop, its certificate in the file, loops again, and refusals."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def test_the_bound_is_the_share_at_which_so_few_failures_are_as_rare_as_the_conf
 
 
 def test_the_bound_covers_every_true_share() -> None:
-    """Exact coverage, no draws: the probability of a bound below the true share is at most 1 - c, whatever the share."""
+    """Exact coverage, no draws: a bound below the true share has a probability of at most 1 - c, whatever the share."""
     for loops in (90, 459):
         bounds = np.array([at_most_fail(k, loops, SURE) for k in range(loops + 1)])
         for share in (1e-4, 0.001, 0.01, 0.02, 0.05, 0.1, 0.3, 0.7, 0.99):

@@ -19,7 +19,7 @@ from loopwright.pipeline.evaluation.certificate.bound import at_most_fail
 from loopwright.pipeline.evaluation.stress.draws import (
     KINDS,
     LATE_LOOPS,
-    LOADS,
+    DRAWN_LOADS,
     MOST_SPAN,
     MOST_ZERO,
     NOISE,
@@ -79,7 +79,7 @@ class CertificatePlan:
             held_out=tuple(case.held_out_seeds),
             parameters=ranges,
             spread=drawing.spread,
-            loads=LOADS,
+            loads=DRAWN_LOADS,
             noise=NOISE,
             late=LATE_LOOPS,
             faulty=drawing.faults,
@@ -206,7 +206,7 @@ def _ends(ranges: Mapping[str, tuple[float, float]]) -> dict[str, list[str]]:
 
 
 def _not_drawn(plants: Sequence[Simulator], ranges: Mapping[str, Any], drawing: Drawing) -> tuple[str, ...]:
-    """What a loop of the family never meets, in words."""
+    """All that no loop of the family meets, in words."""
     names = dict.fromkeys(name for plant in plants for name in plant.parameter_names())
     still = [name for name in names if name not in ranges and name not in drawing.disturbed]
     return (
