@@ -17,9 +17,9 @@ from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.evaluation.certificate.bound import at_most_fail
 from loopwright.pipeline.evaluation.stress.draws import (
+    DRAWN_LOADS,
     KINDS,
     LATE_LOOPS,
-    DRAWN_LOADS,
     MOST_SPAN,
     MOST_ZERO,
     NOISE,
