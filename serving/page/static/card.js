@@ -47,7 +47,7 @@ function certificate(found) {
   if (!found || !(found.lines.length || found.wrong)) return "none";
   if (found.wrong) return `NOT TO BE BELIEVED: ${found.wrong}`;
   const [sentence, ...grounds] = found.lines;
-  return element("details", {}, element("summary", {}, sentence), ...grounds.map((words) => element("p", { class: "note" }, words)));
+  return element("details", {}, element("summary", {}, sentence), ...grounds.map((words) => element("p", {}, words)));
 }
 
 async function copy(event) {
