@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.serving.certificate import CERTIFICATE, certificate_of
 from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.loop import WARM_LEAD_S
@@ -27,6 +28,7 @@ SHOWN = {
     "beyond_reach",
     "calmed",
     "operated",
+    CERTIFICATE,
 }  # entries of the evidence that have a place of their own
 
 
@@ -59,6 +61,7 @@ def card(controller: Controller) -> str:
     lines += ["", f"inputs      {', '.join(m.inputs)}", f"outputs     {', '.join(outputs)}"]
     lines += [f"state       {m.n_state} numbers, all zero: no past", f"info        {', '.join(m.info) or '-'}"]
     lines += ["", "provenance"] + (_tree(m.provenance) or ["  -"])
+    lines += _certificate(controller)
     lines += ["", "evidence"] + (_evidence(m.evidence) or ["  none yet: this controller was not validated"])
     return "\n".join(map(plain, lines))  # provenance and evidence hold any text
 
@@ -71,6 +74,14 @@ def card_json(controller: Controller) -> str:
         file["signed"] = signed.to_dict()
     versions = {"opset": graph.opset, "ir_version": graph.ir_version, "ops": graph.ops}
     return json.dumps({**json.loads(controller.manifest.to_json()), "file": file, "graph": versions}, indent=2)
+
+
+def _certificate(controller: Controller) -> list[str]:
+    """The certificate's sentence and what it rests on; nothing without one."""
+    read = certificate_of(controller.manifest, controller.law_sha256)
+    if read.wrong:
+        return ["", f"certificate: NOT TO BE BELIEVED, {read.wrong}"]
+    return ["", "certificate", *(f"  {line}" for line in read.lines)] if read.certificate else []
 
 
 def _signals(title: str, signals: tuple[Signal, ...], period_s: float) -> list[str]:

@@ -14,7 +14,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loopwright.serving.controller_file import DIGEST_KEY, file_digest, read_controller
+from loopwright.serving.controller_file import DIGEST_KEY, file_digest, law_digest, read_controller
 from loopwright.serving.errors import ArtifactError, ContractError, LoopwrightError, OutputError, SampleError
 from loopwright.serving.graph.audit import audit
 from loopwright.serving.manifest import INPUTS, MANIFEST_KEY, Manifest, Signal
@@ -105,6 +105,7 @@ class Controller:
             raise ArtifactError(f"{self.path}: {error}") from error.__cause__
         self.size_bytes = len(data)
         self.sha256 = file_digest(data)
+        self.law_sha256 = law_digest(data, self.summary.metadata[MANIFEST_KEY])
         self._lock = step_lock()
         self._bind()
 

@@ -48,6 +48,42 @@ def unseal(data: bytes) -> bytes:
     return body
 
 
+# ------------------------------------------------------------------------------- the law alone, whatever is known of it
+def law_digest(data: bytes, manifest: str) -> str:
+    """SHA-256 of a controller file's law: its graph, and its ``manifest`` (the JSON text in it) without the evidence.
+
+    It stays the same where evidence is added. Only the last entry before the digest is taken for the manifest, where
+    the exporter writes it; wherever else it stands, its evidence counts too.
+    """
+    body, entry = data[:-TRAILER_BYTES], _metadata_entry(MANIFEST_KEY, manifest)
+    graph = body.removesuffix(entry)
+    contract = json.loads(manifest)
+    contract.pop("evidence", None)
+    text = json.dumps(contract, sort_keys=True, allow_nan=False)
+    return hashlib.sha256(hashlib.sha256(graph).digest() + text.encode()).hexdigest()
+
+
+def law_in(data: bytes) -> str:
+    """The law's digest of a controller's file; ArtifactError where it is none, or was changed after its export."""
+    unseal(data)
+    return law_digest(data, audit.audit(data).metadata.get(MANIFEST_KEY, ""))
+
+
+def _metadata_entry(key: str, value: str) -> bytes:
+    """An entry of ModelProto.metadata_props as protobuf writes it."""
+    texts = ((b"\x0a", key.encode()), (b"\x12", value.encode()))
+    inner = b"".join(tag + _varint(len(text)) + text for tag, text in texts)
+    return b"\x72" + _varint(len(inner)) + inner
+
+
+def _varint(value: int) -> bytes:
+    found = bytearray()
+    while value > 0x7F:
+        found.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*found, value])
+
+
 # ---------------------------------------------------------------- the manifest for hosts that cannot read the metadata
 INDENTED = 16  # times as long at most as the manifest: the deepest entries have a line and 42 blanks of their own
 

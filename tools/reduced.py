@@ -31,6 +31,7 @@ SMALL: dict[str, Any] = {
     "units": [4],
     "minutes": 0.1,
 }
+CERTIFICATE = {"loops": 10}  # of every case
 LONG = {"jacket_pulses"}  # experiments whose records determine no model when they are short
 TRAINER = {"kind": "lm", "iterations": 15}
 TRAINING = {"iterations": 3, "restarts": 1}  # of laws that learn in closed loop
@@ -43,6 +44,8 @@ OWN_LAW = {"predictive": {"tuning": "given"}, "pid": {"development_seeds": [1], 
 def reduced(tree: dict[str, Any]) -> dict[str, Any]:
     """The sections of params.yaml with the numbers of SMALL, and no more controllers than show every law and case."""
     found = fewer(with_small_own_plants(shrunk(tree)))
+    for case in found["cases"].values():
+        case["certificate"] = CERTIFICATE
     for controller in found["controllers"].values():
         controller["as_printed"] = True  # too small to be good: a lock-up must not end the smoke run
     return found

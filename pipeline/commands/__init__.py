@@ -25,6 +25,7 @@ COMMANDS = {
     "plant": "serve a simulated plant over OPC UA, to try a loop on",
     "playground": "try a plant and two of its controllers by hand in a browser",
     "stress": "close the loops of a controller file over many plants drawn at random",
+    "certify": "bound the share of plants on which a controller file fails: fixed beforehand, drawn, counted",
     "inspect": "show what a controller file is and how its validation went",
     "bench": "measure how long a step of a controller file takes here",
     "keygen": "make a key to sign controller files with",

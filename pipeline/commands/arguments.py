@@ -7,9 +7,12 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
+from loopwright.pipeline.cases import all_cases
+from loopwright.pipeline.cases.own_model import to_train
 from loopwright.pipeline.config.params import PARAMS_FILE, sections
 from loopwright.pipeline.engine.run_mark import runs_here
-from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.errors import ParamsError, nearest
+from loopwright.pipeline.evaluation.case import Case
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.stages.paths import ARTIFACTS
 from loopwright.serving.manifest import Manifest
@@ -58,6 +61,20 @@ def require_made_for(manifest: Manifest, plant: Simulator) -> None:
         raise ParamsError(
             f"the controller's period is {manifest.period_s} s, but plant {plant.name!r} has {plant.period_s}"
         )
+
+
+def case_of(manifest: Manifest) -> Case:
+    """The case that a controller was made for; ParamsError where there is none, or its plant has other signals."""
+    cases = all_cases()
+    if manifest.case not in cases:
+        raise ParamsError(
+            f"the controller is for {manifest.case!r}, which is no case here{nearest(manifest.case, cases)}"
+        )
+    case = cases[manifest.case]
+    if not case.ready:
+        raise ParamsError(f"{case.name} has no models yet; {to_train(case.name)}")
+    require_made_for(manifest, case.plant)
+    return case
 
 
 def require_shipped(file: Path) -> None:

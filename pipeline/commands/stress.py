@@ -3,37 +3,27 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
 import time
 from pathlib import Path
 
 import numpy as np
 
-from loopwright.pipeline.cases import all_cases
-from loopwright.pipeline.cases.own_model import to_train
-from loopwright.pipeline.commands.arguments import real, require_made_for, require_shipped, whole
-from loopwright.pipeline.engine.cluster import address, workers_here
-from loopwright.pipeline.engine.parallel import parallel_map
-from loopwright.pipeline.errors import ParamsError, nearest
-from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.commands.arguments import case_of, real, require_shipped, whole
+from loopwright.pipeline.errors import ParamsError
+from loopwright.pipeline.evaluation.stress.batches import STRESS_BATCH, outcomes_of
 from loopwright.pipeline.evaluation.stress.draws import Drawing
-from loopwright.pipeline.evaluation.stress.loops import Stress, StressOutcome, figures_of, opened
+from loopwright.pipeline.evaluation.stress.loops import Stress, figures_of, opened
 from loopwright.pipeline.evaluation.stress.summary import Summary
 from loopwright.pipeline.export.plain_code.compiled_law import LAW_BY, law_stepping
-from loopwright.pipeline.pictures.drawing import save
 from loopwright.pipeline.pictures.numbers import number
-from loopwright.pipeline.pictures.stress_pictures import loop_canvas
-from loopwright.pipeline.report.stress import TABLE, StressRun, drawn_words, failed_words, write_stress
+from loopwright.pipeline.report.stress import TABLE, StressRun, replay_loop, write_stress
 from loopwright.pipeline.simulation.timetable import TimedValue, at_once, parse_event
-from loopwright.serving.manifest import Manifest
 from loopwright.serving.operating import Operate
 
-# Loops, their seed, spread and faults [%], and loops of a piece of work.
-STRESS_PLANTS, STRESS_SEED, STRESS_SPREAD, STRESS_FAULTS, STRESS_BATCH = 1000, 0, 2.0, 50.0, 100
-FEW = 500  # loops that are done before workers have started
+# Loops, their seed, spread and faults [%].
+STRESS_PLANTS, STRESS_SEED, STRESS_SPREAD, STRESS_FAULTS = 1000, 0, 2.0, 50.0
 OPERATE = "NAME=VALUE"
-PIECES = 4  # a worker at least, so that none waits long for the last
 
 
 def options(parser: argparse.ArgumentParser) -> None:
@@ -68,7 +58,7 @@ def run(options: argparse.Namespace) -> None:
     """Run the loops and write their report; or one of them again."""
     require_shipped(options.file)
     controller, content = opened(options.file)
-    case = _case_of(controller.manifest)
+    case = case_of(controller.manifest)
     drawing = Drawing(case, options.seed, options.spread / 100, options.faults / 100)
     operate = at_once(options.operate)
     Operate(controller.manifest.operate).with_values(operate)  # an error comes before any work
@@ -78,7 +68,8 @@ def run(options: argparse.Namespace) -> None:
     stepping = law_stepping(controller, options.law_by)
     stress = Stress(drawing, content, tuple(operate.items()), stepping.compute)
     if options.replay is not None:
-        _replay(stress, options)
+        picture = f"{case.name}-{options.file.stem}-stress-{options.replay}.png"
+        print(*replay_loop(stress, options.replay, (options.out or Path()) / picture), sep="\n")
         print(f"law stepped by {stepping.words}")
         return
     out = options.out or Path(f"{case.name}-{options.file.stem}-stress")
@@ -102,56 +93,12 @@ def run(options: argparse.Namespace) -> None:
     print(f"report: {out / 'report.html'}")
 
 
-def outcomes_of(
-    stress: Stress, plants: int, batch: int = STRESS_BATCH, workers: int | None = None
-) -> list[StressOutcome]:
-    """Outcomes of the loops 0 to ``plants`` - 1, in order, on the engine."""
-    here = address() is None
-    wanted = workers or (1 if not here or plants <= FEW else os.cpu_count() or 1)
-    size = max(min(batch, plants // (PIECES * wanted)), 1) if wanted > 1 else batch
-    pieces = [range(i, min(i + size, plants)) for i in range(0, plants, size)]
-    with workers_here(wanted if here else workers, "--workers"):
-        found = parallel_map(stress.outcomes, pieces, "stress: batches of loops", [len(p) for p in pieces])
-    return [one for piece in found for one in piece]
-
-
 def _check_folder(out: Path) -> None:
     """ParamsError where a report would take the place of something else."""
     if out.exists() and not out.is_dir():
         raise ParamsError(f"{out} is no folder; name one by --out")
     if (out / "report.html").exists() and not (out / TABLE).exists():
         raise ParamsError(f"{out} holds a report of something else; name another folder by --out")
-
-
-def _replay(stress: Stress, options: argparse.Namespace) -> None:
-    """Run one loop, say what was drawn and how it went, and draw it."""
-    drawing = stress.drawing
-    draw, loop, outcome = stress.loop(options.replay)
-    case, plant = drawing.case, drawing.plant_of(draw.scenario)
-    print(f"loop {draw.index} of seed {drawing.seed}, test {draw.test}: {draw.scenario.title}")
-    print(f"drawn: {drawn_words(draw, plant.mv_signals)}")
-    width = max(len(case.label(name)) for name in outcome.figures)
-    for name, value in outcome.figures.items():
-        print(f"  {case.label(name):{width}}  {value:.6g}")
-    print(f"failed: {failed_words(outcome) or 'no'}")
-    picture = (options.out or Path()) / f"{case.name}-{options.file.stem}-stress-{draw.index}.png"
-    picture.parent.mkdir(parents=True, exist_ok=True)
-    save(loop_canvas(plant, draw, loop, f"Loop {draw.index}: {draw.test}"), picture)
-    print(f"picture: {picture}")
-
-
-def _case_of(manifest: Manifest) -> Case:
-    """The case that the controller was made for; ParamsError where there is none, or its plant has other signals."""
-    cases = all_cases()
-    if manifest.case not in cases:
-        raise ParamsError(
-            f"the controller is for {manifest.case!r}, which is no case here{nearest(manifest.case, cases)}"
-        )
-    case = cases[manifest.case]
-    if not case.ready:
-        raise ParamsError(f"{case.name} has no models yet; {to_train(case.name)}")
-    require_made_for(manifest, case.plant)
-    return case
 
 
 def _options(options: argparse.Namespace) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -20,6 +21,8 @@ from loopwright.serving import fields
 
 T = TypeVar("T")
 PARAMS_FILE = Path("params.yaml")
+MOST_CONFIDENCE = 99.9999  # [%] of a certificate
+MOST_FAILING = 0.5  # share of the plants: a certificate that cannot show so few failures says nothing
 OPTIONAL = {"exports", "plants"}  # sections that may be left out
 
 
@@ -96,14 +99,46 @@ def parse(cls: type[T], values: Mapping[str, Any], where: str) -> T:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class CertificateParams:
+    """``cases.<case>.certificate``: how many loops of which plants a certificate rests on, and what a failure is.
+
+    ``loops`` closed loops of each shipped file, 0: no certificate. ``confidence`` [%]. ``spread`` [%] of a parameter of
+    the plant without a stated range, ``faults`` [%] of the loops with a fault of an actuator. ``limits``: figure ->
+    value above which a loop fails too; ``swings``: whether one fails that swings to the end.
+    """
+
+    loops: int = 90  # without a failure at most 5 % fail, with 99 % confidence
+    confidence: float = 99.0
+    spread: float = 2.0
+    faults: float = 50.0
+    limits: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    swings: bool = False
+
+    def __post_init__(self) -> None:
+        if not 50 <= self.confidence <= MOST_CONFIDENCE:
+            raise ValueError(f"confidence is {self.confidence:g} %; it must be from 50 to {MOST_CONFIDENCE} %")
+        for name in ("spread", "faults"):
+            if not 0 <= getattr(self, name) <= 100:
+                raise ValueError(f"{name} is {getattr(self, name):g} %; it must be from 0 to 100 %")
+        least = math.ceil(math.log(1 - self.confidence / 100) / math.log(1 - MOST_FAILING))
+        if self.loops and self.loops < least:
+            raise ValueError(
+                f"loops is {self.loops}, too few to say anything: even where none fails, more than "
+                f"{100 * MOST_FAILING:g} % may; give {least} or more (459 can show 1 % with 99 % confidence)"
+            )
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class CaseParams:
     """``cases.<case>``: what validation and report need beyond the case's own text.
 
-    ``operated`` are further tests of laws with ``operate``, by name.
+    ``operated`` are further tests of laws with ``operate``, by name. ``certificate`` says on which closed loops the
+    certificate of each shipped file rests.
     """
 
     held_out_seeds: tuple[int, ...]
     noise_seed: int = 0
+    certificate: CertificateParams = CertificateParams()
     operated: Mapping[str, OperatedTestParams] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:

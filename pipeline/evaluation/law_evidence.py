@@ -16,6 +16,7 @@ from loopwright.pipeline.evaluation.operated import OperatedResult
 from loopwright.pipeline.evaluation.typed_json import parsed, read_mapping, to_json
 from loopwright.pipeline.files import write_text
 from loopwright.pipeline.simulation import NOISE_SUFFIX
+from loopwright.serving.certificate import Certificate
 
 Array = NDArray[np.float64]
 Loop = dict[str, Array]
@@ -123,7 +124,7 @@ class LawMetrics:
     their set point; ``calmed``: why the law's own numbers are not shipped, a clause after
     its name, where calmer ones hold; all figures are then of these; ``cold_start``: what the files ask for at rests of
     the record, of a case on models; ``operated``: test -> what came of it, of a law with ``operate``, by its shipped
-    file.
+    file; ``certificate``: that of the shipped file.
     """
 
     name: str
@@ -149,6 +150,7 @@ class LawMetrics:
     calmed: str = ""
     cold_start: ColdStart | None = None
     operated: Mapping[str, OperatedResult] = field(default_factory=dict)
+    certificate: Certificate | None = None
 
     @property
     def why_withheld(self) -> str:

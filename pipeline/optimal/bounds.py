@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import ast
 import inspect
 import json
-import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.evaluation.case import Case, Effort
 from loopwright.pipeline.evaluation.metric import together
-from loopwright.pipeline.files import digest
 from loopwright.pipeline.plants.equations import EquationPlant, equations
+from loopwright.pipeline.plants.plant_digest import equations_digest
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
 Bounds = dict[str, dict[str, dict[str, float]]]
@@ -53,44 +49,13 @@ def problem(case: Case) -> dict[str, Any]:
     """Everything that a case's bounds depend on, beside the scenarios: stored, and compared with what is stored."""
     aim = {key: getattr(case, key) for key in DEFAULTS} | {"limits": dict(case.limits), "effort": asdict(case.effort)}
     as_read: dict[str, Any] = json.loads(json.dumps(aim))
-    return {"plant": plant_digest(equations(case.plant, f"a bound of case {case.name!r}")), **as_read}
+    return {"plant": equations_digest(equations(case.plant, f"a bound of case {case.name!r}")), **as_read}
 
 
 def bounded(case: Case, scenarios: Sequence[Scenario]) -> bool:
     """Whether a test has bounds: not where it runs on a map from sample to sample, which no solver here plans over."""
     plants = (type(s.plant or case.plant) for s in scenarios)
     return all(issubclass(p, EquationPlant) and p.transition is EquationPlant.transition for p in plants)
-
-
-def plant_digest(plant: EquationPlant) -> str:
-    """sha256 of the plant's equations, parameters and sampling; comments and layout do not count.
-
-    An output of its own mostly calls other functions, so it counts by its values over the states'
-    ranges, six digits of them; the rates too, whose constants may stand outside of ``derivative``.
-    A plant with a discrete MV counts with the values of its relaxation.
-    """
-    source = ast.parse(textwrap.dedent(inspect.getsource(type(plant).derivative)))
-    function = source.body[0]
-    if isinstance(function, ast.FunctionDef) and ast.get_docstring(function) is not None:
-        function.body = function.body[1:]
-    names = dict(zip(plant.parameter_names(), plant.parameters().tolist(), strict=True))
-    what = [ast.unparse(source), names, plant.period_s, plant.time_unit_s, plant.substeps]
-    if not plant.measures_states:
-        what.append(_probe(plant))
-    if any(s.values is not None for s in plant.mv_signals):
-        what.append(_probe(plant.relaxed()))
-    return digest(what)
-
-
-def _probe(plant: EquationPlant) -> list[str]:
-    signals = (*plant.state_signals, *plant.mv_signals)
-    low, high = (np.array([getattr(s, end) for s in signals]) for end in ("low", "high"))
-    digits = []
-    for fractions in np.random.default_rng(0).uniform(0.1, 0.9, (7, len(signals))):
-        x, mv = np.split(low + fractions * (high - low), [len(plant.state_signals)])
-        values = (plant.measure(x), plant.rate(x, mv, plant.dv_nominal, plant.parameters()))
-        digits += [f"{v:.6g}" for v in np.concatenate([np.array(v).ravel() for v in values])]
-    return digits
 
 
 def read_stored(path: Path) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from loopwright.pipeline.files import digest, read_json, write_json
 from loopwright.pipeline.optimal.bounds import Bounds
 from loopwright.pipeline.optimal.nmpc_horizon import MOVE_WEIGHT
 from loopwright.pipeline.plants.identified import IdentifiedPlant, shift_rows
+from loopwright.pipeline.plants.plant_digest import identified_digest
 from loopwright.pipeline.plants.simulator import Array
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 
@@ -233,7 +234,7 @@ def model_bounds(case: Case, kept: Path) -> Bounds:
     known, keys = _read(kept), {(name, i): _key(test) for name, rows in tests.items() for i, test in enumerate(rows)}
     work = [item for item, key in keys.items() if key not in known]
     # Sequences of one model follow each other: a process builds the problem of a model once.
-    work.sort(key=lambda item: _plant_key(_plant(tests[item[0]][item[1]])))
+    work.sort(key=lambda item: identified_digest(_plant(tests[item[0]][item[1]])))
     found = (
         parallel_map(partial(_bound, case), work, f"report {case.name}: the bound, control that knows the model (NMPC)")
         if work
@@ -263,7 +264,7 @@ class _Same:
     """A plant that equals any other of the same equation and start."""
 
     def __init__(self, plant: IdentifiedPlant) -> None:
-        self.plant, self.key = plant, _plant_key(plant)
+        self.plant, self.key = plant, identified_digest(plant)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Same) and other.key == self.key
@@ -286,18 +287,8 @@ def _plant(test: Scenario) -> IdentifiedPlant:
     return test.plant
 
 
-def _plant_key(plant: IdentifiedPlant) -> str:
-    """Digest of the equation, where the plant starts, and the ranges that errors and moves are counted in."""
-    f = plant.arrays
-    numbers = (f.a, f.b, f.c, f.w1, f.b1, f.w2, f.y_center, f.y_scale, f.v_center, f.v_scale, *plant.start)
-    ranges = [[s.low, s.high] for s in (*plant.sp_signals, *plant.mv_signals)]
-    moves = [s.max_move for s in plant.mv_signals]
-    limits = [moves] if any(moves) else []
-    return digest([[f"{v:.9g}" for v in np.ravel(array)] for array in numbers] + [ranges, plant.period_s, *limits])
-
-
 def _key(test: Scenario) -> str:
-    return digest([_plant_key(_plant(test)), test.digest(), list(HORIZON), EVERY])
+    return digest([identified_digest(_plant(test)), test.digest(), list(HORIZON), EVERY])
 
 
 def _read(kept: Path) -> dict[str, dict[str, float]]:

@@ -124,6 +124,7 @@ def context(evidence: Evidence, judged: Judged, pictures: Mapping[str, str], own
         "baseline": law_name(case.baseline),
         "laws": [law_row(evidence, law) for law in evidence.laws],
         "scenarios": scenario_rows(evidence),
+        "certificates": {n: c for n in shipped if (c := evidence.laws[n].metrics.certificate) is not None},
         "gone_wrong": wrong_rows(evidence),
         "late": [words for law in shipped if (words := dead_time_to_state(evidence, law))],
         "further": further_figures(evidence),

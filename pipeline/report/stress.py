@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from loopwright.pipeline.evaluation.stress.draws import KINDS, MOST_SPAN, MOST_ZERO, STROKE, STUCK_FOR, Draw
-from loopwright.pipeline.evaluation.stress.loops import Stress, StressOutcome
+from loopwright.pipeline.evaluation.stress.loops import REFUSED, Stress, StressOutcome
 from loopwright.pipeline.evaluation.stress.summary import LOOP_QUANTILES, Summary, table
 from loopwright.pipeline.files import draft_of
 from loopwright.pipeline.pictures.drawing import save
@@ -112,13 +112,7 @@ def _loop_row(run: StressRun, draw: Draw, outcome: StressOutcome, relative: floa
 
 def failed_words(outcome: StressOutcome) -> str:
     """How a loop failed; empty where it did not."""
-    words = {
-        "locked up": outcome.locked_up,
-        "left its limits": outcome.left_limits,
-        f"{outcome.refused} samples refused": outcome.refused > 0,
-        "left what the plant can compute": outcome.broke,
-    }
-    return ", ".join(text for text, holds in words.items() if holds)
+    return ", ".join(f"{name} ({outcome.refused})" if name == REFUSED else name for name in outcome.failures)
 
 
 def drawn_words(draw: Draw, signals: Sequence[Signal]) -> str:
@@ -128,6 +122,23 @@ def drawn_words(draw: Draw, signals: Sequence[Signal]) -> str:
     words += ["one more sample of dead time"] if draw.late else []
     words += [draw.fault.words(signals)] if draw.fault is not None else []
     return ", ".join(words)
+
+
+def replay_loop(stress: Stress, index: int, picture: Path) -> list[str]:
+    """Run one loop again and draw it into ``picture``; what was drawn at random and how it went, in lines."""
+    drawing = stress.drawing
+    draw, loop, outcome = stress.loop(index)
+    case, plant = drawing.case, drawing.plant_of(draw.scenario)
+    width = max(len(case.label(name)) for name in outcome.figures)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    save(loop_canvas(plant, draw, loop, f"Loop {draw.index}: {draw.test}"), picture)
+    return [
+        f"loop {draw.index} of seed {drawing.seed}, test {draw.test}: {draw.scenario.title}",
+        f"drawn: {drawn_words(draw, plant.mv_signals)}",
+        *(f"  {case.label(name):{width}}  {value:.6g}" for name, value in outcome.figures.items()),
+        f"failed: {failed_words(outcome) or 'no'}",
+        f"picture: {picture}",
+    ]
 
 
 def _write_table(path: Path, columns: Mapping[str, list[object]], run: StressRun) -> None:

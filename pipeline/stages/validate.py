@@ -15,10 +15,19 @@ import numpy as np
 
 from loopwright.pipeline.cases import all_cases
 from loopwright.pipeline.cases.operated_trials import try_operated
-from loopwright.pipeline.config.params import CaseParams, ControllerParams, choose, parse, read_section, sections
+from loopwright.pipeline.config.params import (
+    CaseParams,
+    CertificateParams,
+    ControllerParams,
+    choose,
+    parse,
+    read_section,
+    sections,
+)
 from loopwright.pipeline.engine.command import run_stage
-from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.errors import LawError, PlantError
 from loopwright.pipeline.evaluation.case import Case
+from loopwright.pipeline.evaluation.certificate.plan import CertificatePlan
 from loopwright.pipeline.evaluation.evidence import WITHHELD, Evidence
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
 from loopwright.pipeline.evaluation.extrapolation import grounds_of, widest
@@ -35,6 +44,8 @@ from loopwright.pipeline.evaluation.law_evidence import (
 from loopwright.pipeline.evaluation.model_evidence import identified_part
 from loopwright.pipeline.evaluation.open_loop import cold_start, errors_at_rest, first_answers, replay
 from loopwright.pipeline.evaluation.poor_laws import why_poor
+from loopwright.pipeline.evaluation.stress.batches import outcomes_of
+from loopwright.pipeline.evaluation.stress.loops import Stress, opened
 from loopwright.pipeline.evaluation.trials import Metrics, Trial, step_us, try_files
 from loopwright.pipeline.export.controller_file import with_evidence, withhold
 from loopwright.pipeline.files import read_json, write_json
@@ -49,7 +60,8 @@ from loopwright.pipeline.stages.paths import (
     step_time_file,
     validation_folder,
 )
-from loopwright.serving.controller import Controller
+from loopwright.serving.certificate import CERTIFICATE, Certificate
+from loopwright.serving.controller import Controller, runtime_version
 from loopwright.serving.controller_file import controller_files
 
 NOTHING = "so nothing is shipped"
@@ -130,6 +142,9 @@ def validate(name: str) -> None:
     if metrics.poor:
         why, _, remedy = metrics.poor.rpartition("; ")
         withheld = f"controllers.{name} {why}, {NOTHING}; {remedy}"
+    if not (refused or params.name == case.old_loop):
+        certificate = _certified(case, choices.certificate, source, folder / "certificate_plan.json", name)
+        metrics = replace(metrics, certificate=certificate)
     metrics.write(folder / "metrics.json")
     took = step_us(Controller(source), next(iter(shipped.curves.values())), case.plant.dv_nominal)
     write_json(step_time_file(params.case, params.name), took)
@@ -157,6 +172,8 @@ def validate(name: str) -> None:
         evidence["operated"] = {test: result.figures() for test, result in operated.items()}
     if locked_up:
         evidence |= {"locked_up": locked_up, "as_printed": True}
+    if metrics.certificate is not None:
+        evidence[CERTIFICATE] = metrics.certificate.to_dict()
     target = ARTIFACTS / params.case / f"{params.name}.onnx"
     if params.name == case.old_loop:
         withhold(target, RIVAL)
@@ -311,6 +328,26 @@ def _over_seeds(rows: Mapping[int, Metrics]) -> OverSeeds:
         for reduce in (statistics.median, min, max)
     )
     return OverSeeds(median, low, high, {str(seed): row for seed, row in rows.items()})
+
+
+def _certified(case: Case, asked: CertificateParams, file: Path, written: Path, name: str) -> Certificate | None:
+    """The certificate of a file, whose plan is ``written`` before its first loop runs.
+
+    None where none is asked for, or no other plant can be drawn.
+    """
+    if not asked.loops:
+        return None
+    controller, content = opened(file)
+    try:
+        plan = CertificatePlan(controller.law_sha256, case, asked)
+    except PlantError as error:
+        print(f"validate {name}: no certificate: {error}", file=sys.stderr)
+        return None
+    write_json(written, plan.record())
+    outcomes = outcomes_of(Stress(plan.drawing(), content), asked.loops, label=f"validate {name}: certificate")
+    found = plan.certificate(outcomes, f"onnxruntime {runtime_version()}")
+    print(f"validate {name}: {found.sentence}", file=sys.stderr)
+    return found
 
 
 def _evidence(case: Case, base: list[Trial], shipped: Trial, grounds: Grounds | None) -> dict[str, Any]:

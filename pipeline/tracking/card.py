@@ -15,6 +15,7 @@ from loopwright.pipeline.evaluation.metric import ratio_to_bound, with_unit
 from loopwright.pipeline.evaluation.validation import Validation
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX
 from loopwright.pipeline.tracking.gate import Gate, Rank
+from loopwright.serving.certificate import CertificateRead
 
 GAP = "&nbsp;" * 4
 """Cells have no padding there and may not be styled."""
@@ -64,12 +65,14 @@ def version_description(
     picture: str | None,
     signed: str = "",
     operated: Mapping[str, str] | None = None,
+    certificate: CertificateRead | None = None,
 ) -> str:
-    """A version's description: verdict, signer, closed-loop evidence per scenario, analysis, picture of the loop.
+    """A version's description: verdict, signer, certificate, evidence per scenario, analysis, picture of the loop.
 
     ``operated`` are the pictures of tests in which operators change something, by test: the worst of them is shown.
     """
     parts = [_verdict(gate), f"<p>Signed by {escape(signed)}.</p>" if signed else "", _grounds(validation)]
+    parts += [_certificate(certificate)] if certificate is not None else []
     if validation is not None:
         parts += [_table(validation, gate), _operated(validation, gate.law), _analysis(validation, gate.law)]
     if picture:
@@ -85,6 +88,17 @@ def _grounds(validation: Validation | None) -> str:
     if validation is None or validation.grounds is None:
         return ""
     return f"<p>Every figure was measured {escape(validation.grounds.words)}; none on the plant.</p>"
+
+
+def _certificate(read: CertificateRead) -> str:
+    """The certificate's sentence, and what it rests on as a list; nothing for a file without one."""
+    if read.wrong:
+        return f"<p>Its certificate is NOT TO BE BELIEVED: {escape(read.wrong)}.</p>"
+    if read.certificate is None:
+        return ""
+    sentence, *grounds = read.lines
+    listed = "".join(f"<li>{escape(words)}</li>" for words in grounds)
+    return f"<p><b>Certificate</b>: {escape(sentence)}.</p><ul>{listed}</ul>"
 
 
 def _verdict(gate: Gate) -> str:

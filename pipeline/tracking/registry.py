@@ -28,7 +28,8 @@ from loopwright.pipeline.tracking import card, signing
 from loopwright.pipeline.tracking.gate import Gate
 from loopwright.pipeline.tracking.signing import Signer
 from loopwright.pipeline.tracking.store import missing_file
-from loopwright.serving.controller_file import EXPLAIN_SUFFIX, manifest_in, require_sidecar
+from loopwright.serving.certificate import certificate_of
+from loopwright.serving.controller_file import EXPLAIN_SUFFIX, law_in, manifest_in, require_sidecar
 from loopwright.serving.errors import ArtifactError, SignatureError
 from loopwright.serving.explain.explain_file import explain_path
 from loopwright.serving.words import harmless, plain
@@ -88,7 +89,8 @@ def register(
     if not client.search_registered_models(f"name = '{name}'"):
         client.create_registered_model(name, tags={"standing": "not compared yet", "case": case, "law": law})
     known = next((v for v in versions(client, name) if v.tags.get("sha256") == digest), None)
-    manifest = manifest_in(path.read_bytes())
+    data = path.read_bytes()
+    manifest = manifest_in(data)
     if path.with_suffix(".json").exists():
         require_sidecar(path)
     beside = explain_path(path)  # the run of a known version has the file of then
@@ -97,7 +99,9 @@ def register(
     before, at = ({}, run_id) if known is None else (dict(known.tags), str(known.run_id))
     signature = signing.present(before) if signer is None else signer.attach(client, at, path, before)
     signed = signing.words(signature)
-    description = harmless(card.version_description(validation, gate, run_id, picture, signed, operated))
+    certificate = certificate_of(manifest, law_in(data))
+    description = card.version_description(validation, gate, run_id, picture, signed, operated, certificate)
+    description = harmless(description)
     analysis = {f"analysis_{name}": f"{value:.6g}" for name, value in card.analysis_figures(validation, law).items()}
     shown = {**gate.tags(), **analysis, **own, **signature, **tags}  # in this order they are shown
     tags = {key: plain(value) for key, value in shown.items()}

@@ -28,7 +28,7 @@ class AdaptedController(Controller):
     def __init__(self, inner: Controller, loop: Manifest) -> None:
         own = inner.manifest
         self.inner, self.manifest = inner, _seen_as(own, loop)
-        self.path, self.sha256 = inner.path, inner.sha256
+        self.path, self.sha256, self.law_sha256 = inner.path, inner.sha256, inner.law_sha256
         self.size_bytes, self.summary = inner.size_bytes, inner.summary
         self._pv, self._dv = _places(own.pv, loop.pv), _places(own.dv, loop.dv)
 

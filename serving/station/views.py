@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from loopwright.serving.bridging import BRIDGE_PERIODS
+from loopwright.serving.certificate import certificate_of
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample
@@ -250,7 +251,7 @@ def _card(controller: Controller) -> View:
     m, evidence = controller.manifest, controller.manifest.evidence
     scenarios = evidence.get("scenarios")
     rows = scenarios if isinstance(scenarios, dict) else {}
-    signed = signer(controller)
+    signed, certificate = signer(controller), certificate_of(m, controller.law_sha256)
     found = {
         "law": m.law,
         "case": m.case,
@@ -263,6 +264,7 @@ def _card(controller: Controller) -> View:
         "versions": m.provenance.get("versions", {}),
         "lock_ups": evidence.get("lock_ups"),
         "unproven": judged(m).why,  # empty: it is proven
+        "certificate": {"lines": list(certificate.lines), "wrong": certificate.wrong},
         "scenarios": {name: row for name, row in rows.items() if isinstance(row, dict)},
         "units": evidence.get("units", {}),
         "picture": picture(controller) is not None,

@@ -20,7 +20,8 @@ from loopwright.serving.arguments import write_any_text
 
 ROOT = Path(__file__).parents[2]
 COMMANDS_OF_TODAY = {
-    "new", "run", "check", "results", "simulate", "stress", "inspect", "bench", "laws", "models", "bounds", "registry",
+    "new", "run", "check", "results", "simulate", "stress", "certify", "inspect", "bench", "laws", "models",
+    "bounds", "registry",
     "loop", "plant", "keygen", "sign", "verify", "conformance", "c", "st", "fmu", "playground",
 }  # fmt: skip
 

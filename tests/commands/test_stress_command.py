@@ -127,7 +127,7 @@ def test_a_controller_of_no_case_is_refused(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copy(PH, "pid.onnx")
-    monkeypatch.setattr("loopwright.pipeline.commands.stress.all_cases", dict)
+    monkeypatch.setattr("loopwright.pipeline.commands.arguments.all_cases", dict)
     assert main(["stress", "pid.onnx"]) == 2
     assert "the controller is for 'ph_neutralization', which is no case here" in capsys.readouterr().err
 

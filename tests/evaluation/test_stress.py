@@ -14,9 +14,9 @@ from own_cases import controllers_of_a_lag
 
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.cases.own_plant import OwnCase
-from loopwright.pipeline.commands.stress import outcomes_of
 from loopwright.pipeline.engine.cluster import connected, local_cluster
 from loopwright.pipeline.errors import PlantError
+from loopwright.pipeline.evaluation.stress.batches import outcomes_of
 from loopwright.pipeline.evaluation.stress.draws import KINDS, LATE_LOOPS, NOISE, Actuators, Draw, Drawing
 from loopwright.pipeline.evaluation.stress.loops import Stress, advance_rows, swings
 from loopwright.pipeline.evaluation.stress.summary import Summary, table

@@ -26,13 +26,13 @@ from loopwright.pipeline.optimal.bounds import (
     DEFAULTS,
     bounded,
     bounds_path,
-    plant_digest,
     problem,
     stored_bounds,
     together,
 )
 from loopwright.pipeline.optimal.nmpc_horizon import Horizon, NmpcPlan
 from loopwright.pipeline.optimal.perfect import run_offline
+from loopwright.pipeline.plants.plant_digest import equations_digest
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.pipeline.stages import bounds as bounds_stage
 
@@ -154,9 +154,9 @@ def test_the_digest_follows_parameters_and_equations_not_comments() -> None:
             # a comment and no docstring
             return ThiosulfateCstr.derivative(self, x, mv, dv)
 
-    assert plant_digest(plant) == plant_digest(ThiosulfateCstr())
-    assert plant_digest(plant) != plant_digest(plant.with_parameters({"UA": 19_999.0}))
-    assert plant_digest(plant) != plant_digest(Commented())
+    assert equations_digest(plant) == equations_digest(ThiosulfateCstr())
+    assert equations_digest(plant) != equations_digest(plant.with_parameters({"UA": 19_999.0}))
+    assert equations_digest(plant) != equations_digest(Commented())
 
 
 def _bounded() -> list[str]:
@@ -289,10 +289,10 @@ def test_the_digest_follows_what_an_output_calls() -> None:
             """Another text."""
             return ca.vertcat(PhNeutralization.output(self, x))
 
-    own = plant_digest(PhNeutralization())
-    assert plant_digest(Same()) == own
-    assert plant_digest(Wider()) != own
-    assert plant_digest(Other()) != own
+    own = equations_digest(PhNeutralization())
+    assert equations_digest(Same()) == own
+    assert equations_digest(Wider()) != own
+    assert equations_digest(Other()) != own
 
 
 OFFSET = 1e-3

@@ -20,10 +20,10 @@ from loopwright.pipeline.errors import PlantError
 from loopwright.pipeline.evaluation.case import Array, Case, Effort
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.metric import METRICS, Metric
-from loopwright.pipeline.optimal.bounds import plant_digest
 from loopwright.pipeline.optimal.nmpc_horizon import Horizon
 from loopwright.pipeline.optimal.perfect import PerfectNmpc, run_nmpc, run_offline
 from loopwright.pipeline.plants.equations import EquationPlant
+from loopwright.pipeline.plants.plant_digest import equations_digest
 from loopwright.pipeline.simulation.scenario import Scenario, held
 from loopwright.pipeline.simulation.simulate import simulate_closed, simulate_open
 from loopwright.pipeline.stages import bounds as bounds_stage
@@ -140,9 +140,9 @@ def test_a_discrete_mv_without_relaxation_is_refused(vessel: JacketedBatchReacto
 
 
 def test_the_digest_follows_the_relaxation(vessel: JacketedBatchReactor, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = plant_digest(vessel)
+    own = equations_digest(vessel)
     monkeypatch.setattr("loopwright.pipeline.cases.jacketed_batch_reactor.plant.LEAK", 0.1)
-    assert plant_digest(vessel) != own
+    assert equations_digest(vessel) != own
 
 
 # ---------------------------------------------------------------------- a reference, and a plan that is followed

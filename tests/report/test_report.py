@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
 
 import made_up_case as made_up
@@ -18,10 +19,14 @@ from made_up_case import CASE
 from undrawn import draw_nothing
 
 from loopwright.pipeline.cases import CASES
+from loopwright.pipeline.config.params import CertificateParams
 from loopwright.pipeline.errors import ReportError
 from loopwright.pipeline.evaluation.case import Curve, PaperFigure, Requirement
+from loopwright.pipeline.evaluation.certificate.plan import CertificatePlan
 from loopwright.pipeline.evaluation.evidence import Evidence
 from loopwright.pipeline.evaluation.evidence_basis import Grounds
+from loopwright.pipeline.evaluation.law_evidence import LawMetrics
+from loopwright.pipeline.evaluation.stress.loops import StressOutcome
 from loopwright.pipeline.evaluation.verdicts import PLAIN, close
 from loopwright.pipeline.optimal import bounds
 from loopwright.pipeline.report.page import context
@@ -293,3 +298,24 @@ def test_a_partial_file_of_bounds_gives_a_report_that_says_what_is_missing(
         text = (folder / name).read_text()
         assert "The perfect-model NMPC was not computed for: ua." in text
         assert "This case has no bounds" not in text
+
+
+def test_certificates_of_the_shipped_laws_are_shown_with_what_they_rest_on(root):
+    case = CASES[CASE]
+    plan = CertificatePlan("a" * 64, case, CertificateParams(loops=8))
+    outcomes = [StressOutcome(k, {"mae": 0.1}, k == 3, False, 0, False) for k in range(8)]
+    certificate = plan.certificate(outcomes, "a host")
+    evidence = load(root)
+    before = context(evidence, judge(evidence, PLAIN), {}, ())
+    law = evidence.laws["pid"]
+    evidence.laws["pid"] = replace(law, metrics=replace(law.metrics, certificate=certificate))
+    content = context(evidence, judge(evidence, PLAIN), {}, ())
+    assert content["certificates"] == {"pid": certificate}
+    for page in ("report.html.j2", "report.md.j2"):
+        shown = unescape(render(page, content))
+        assert certificate.sentence[3:] in shown
+        assert all(words[1:] in shown for words in certificate.grounds)
+        assert "Certificates" not in render(page, before)
+    path = root / "metrics.json"
+    evidence.laws["pid"].metrics.write(path)
+    assert LawMetrics.read(path).certificate == certificate

@@ -17,12 +17,13 @@ import yaml
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.cases.thiosulfate_cstr.case import TJ, ThiosulfateCstrCase
 from loopwright.pipeline.engine.command import run_stage
-from loopwright.pipeline.errors import LawError
+from loopwright.pipeline.errors import LawError, PlantError
 from loopwright.pipeline.evaluation.law_evidence import LawMetrics
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.simulation.scenario import Scenario, held
 from loopwright.pipeline.stages import validate as stage
 from loopwright.serving import Controller
+from loopwright.serving.certificate import certificate_of
 
 CASE, LAW = "thiosulfate_cstr", "pid"
 FILE = Path(__file__).parents[2] / "artifacts" / CASE / f"{LAW}.onnx"
@@ -123,6 +124,43 @@ def test_a_sound_law_is_shipped_without_a_word(made: Callable[..., None]) -> Non
     assert list(measured.forms["base"].tests) == ["step", "step_noise"]
     with np.load(MEASURED.with_name("trajectories.npz")) as curves:
         assert curves[f"longer/base/{measured.shipped_seed}/pv"].shape == (160, 2)
+
+
+def test_a_shipped_law_has_a_certificate_of_few_loops(made: Callable[..., None]) -> None:
+    made(hard=False)
+    stage.validate(f"{CASE}-{LAW}")
+    controller = Controller(SHIPPED)
+    found = certificate_of(controller.manifest, controller.law_sha256).certificate
+    assert found is not None
+    assert (found.loops, found.confidence, found.small) == (90, 0.99, True)
+    assert LawMetrics.read(MEASURED).certificate == found
+    plan = json.loads(MEASURED.with_name("certificate_plan.json").read_text())
+    assert (plan["plan"], plan["seed"], plan["loops"]) == (found.plan, found.seed, 90)
+
+
+def test_params_yaml_asks_for_other_certificates_or_for_none(made: Callable[..., None]) -> None:
+    made(hard=False)
+    tree = yaml.safe_load(Path("params.yaml").read_text())
+    for asked, loops in (({"loops": 12, "spread": 1.0}, 12), ({"loops": 0}, None)):
+        tree["cases"][CASE]["certificate"] = asked
+        Path("params.yaml").write_text(yaml.safe_dump(tree))
+        stage.validate(f"{CASE}-{LAW}")
+        found = LawMetrics.read(MEASURED).certificate
+        assert (None if found is None else found.loops) == loops
+    assert "certificate" not in Controller(SHIPPED).manifest.evidence
+
+
+def test_a_plant_without_parameters_is_shipped_without_a_certificate(
+    made: Callable[..., None], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(*_: object) -> dict[str, tuple[float, float]]:
+        raise PlantError("plant 'bare' has no parameters")
+
+    made(hard=False)
+    monkeypatch.setattr("loopwright.pipeline.evaluation.stress.draws.Drawing.ranges", none)
+    stage.validate(f"{CASE}-{LAW}")
+    assert "no certificate: plant 'bare' has no parameters" in capsys.readouterr().err
+    assert "certificate" not in Controller(SHIPPED).manifest.evidence
 
 
 @pytest.mark.parametrize("same_row", [True, False])

@@ -14,7 +14,9 @@ from pathlib import Path
 
 ABSENT = ("torch", "casadi", "onnx", "scipy", "pandas", "asyncua", "starlette", "mlflow", "yaml", "pip")
 EXTRAS = {
-    **dict.fromkeys(("new", "run", "check", "results", "simulate", "stress", "laws", "models", "bounds"), "pipeline"),
+    **dict.fromkeys(
+        ("new", "run", "check", "results", "simulate", "stress", "certify", "laws", "models", "bounds"), "pipeline"
+    ),
     **dict.fromkeys(("plant", "registry"), "pipeline"),
     "loop": "plant",
 }

@@ -110,6 +110,7 @@ class Actuators:
         return self.position, given
 
 
+DRAWN_LOADS = (0.0, 1.0)  # times the test's disturbances
 NOISE = (0.5, 2.0)  # times the case's measurement noise
 LATE_LOOPS = 0.5  # share of the loops with one more sample of dead time
 MIXED_LEVELS = 2  # of a test, of which a random set point is a mixture
@@ -202,7 +203,7 @@ class Drawing:
         rng = np.random.default_rng((self.seed, index))
         name = list(self.tests)[int(rng.integers(len(self.tests)))]
         test = self.tests[name][int(rng.integers(len(self.tests[name])))]
-        plant, share = self.plant_of(test), float(rng.uniform())
+        plant, share = self.plant_of(test), float(rng.uniform(*DRAWN_LOADS))
         parameters = {key: float(rng.uniform(*ends)) for key, ends in self.ranges(plant).items()}
         noise, late = float(rng.uniform(*NOISE)), bool(rng.uniform() < LATE_LOOPS)
         faulty = bool(rng.uniform() < self.faults)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -103,9 +103,24 @@ class StressOutcome:
     swings: bool = False
 
     @property
+    def failures(self) -> tuple[str, ...]:
+        """How the loop failed, of LOOP_FAILURES; empty where it did not."""
+        return tuple(name for name, holds in LOOP_FAILURES.items() if holds(self))
+
+    @property
     def failed(self) -> bool:
         """Whether the loop is lost, whatever its figures."""
-        return self.locked_up or self.left_limits or self.refused > 0 or self.broke
+        return bool(self.failures)
+
+
+REFUSED, SWINGS = "had a refused sample", "swings to the end"
+LOOP_FAILURES: Mapping[str, Callable[[StressOutcome], bool]] = {
+    "locked up": lambda o: o.locked_up,
+    "left its limits": lambda o: o.left_limits,
+    REFUSED: lambda o: o.refused > 0,
+    "left what the plant can compute": lambda o: o.broke,
+}
+"""How a loop can fail: words that go on ``a loop that ...`` -> whether one did."""
 
 
 @dataclass(frozen=True)

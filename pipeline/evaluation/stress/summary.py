@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from loopwright.pipeline.evaluation.case import Case, Requirement
 from loopwright.pipeline.evaluation.stress.draws import Draw
-from loopwright.pipeline.evaluation.stress.loops import StressOutcome, figures_of
+from loopwright.pipeline.evaluation.stress.loops import LOOP_FAILURES, SWINGS, StressOutcome, figures_of
 from loopwright.pipeline.plants.simulator import Array
 
 LOOP_QUANTILES = (0.05, 0.5, 0.9, 0.99, 1.0)  # of a figure over the loops of one test or of all, the largest value last
@@ -69,12 +69,9 @@ class Summary:
     def counts(self) -> dict[str, int]:
         """Loops that failed, by how, and those that swing; a loop may count several times."""
         return {
-            "locked up": sum(o.locked_up for o in self.outcomes),
-            "left its limits": sum(o.left_limits for o in self.outcomes),
-            "had a refused sample": sum(o.refused > 0 for o in self.outcomes),
-            "left what the plant can compute": sum(o.broke for o in self.outcomes),
+            **{name: sum(map(holds, self.outcomes)) for name, holds in LOOP_FAILURES.items()},
             "any of these": sum(o.failed for o in self.outcomes),
-            "swings to the end": sum(o.swings for o in self.outcomes),
+            SWINGS: sum(o.swings for o in self.outcomes),
         }
 
     @cached_property

@@ -22,6 +22,7 @@ export function describe(about) {
     ["period", `${c.period_s} s`],
     ["closed loop", c.unproven === undefined ? "not known" : c.unproven ? `NOT PROVEN: ${c.unproven}` : "proven"],
     ["lock-ups", c.lock_ups === 0 ? "none in its validation" : String(c.lock_ups ?? "not known")],
+    ["certificate", certificate(c.certificate)],
   ];
   const making = [
     ["commit", c.commit ? c.commit.slice(0, 12) : "–"],
@@ -39,6 +40,14 @@ const list = (facts) => element("dl", {}, ...facts.flatMap(([name, value]) => [e
 function signer(signed) {
   const until = signed.expires ? `, until ${signed.expires.slice(0, 10)}` : "";
   return element("span", { title: `key ${signed.fingerprint}` }, `${signed.name} (key ${signed.fingerprint.slice(0, 16)})${until}`);
+}
+
+// The sentence, and on demand what it rests on: what a failure is, what was drawn, and what was not.
+function certificate(found) {
+  if (!found || !(found.lines.length || found.wrong)) return "none";
+  if (found.wrong) return `NOT TO BE BELIEVED: ${found.wrong}`;
+  const [sentence, ...grounds] = found.lines;
+  return element("details", {}, element("summary", {}, sentence), ...grounds.map((words) => element("p", {}, words)));
 }
 
 async function copy(event) {

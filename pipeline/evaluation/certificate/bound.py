@@ -1,0 +1,24 @@
+"""The exact bound on a share of failures (Clopper and Pearson, 1934)."""
+
+from __future__ import annotations
+
+import math
+
+from scipy.stats import beta
+
+
+def at_most_fail(failures: int, loops: int, confidence: float) -> float:
+    """The largest share of failures that ``failures`` of ``loops`` independent loops allow, one-sided.
+
+        p such that P(at most k failures among n | p) = 1 - c,   p = Beta^-1(c; k + 1, n - k),   1 where all failed
+
+    Whatever the true share is, it lies above this bound in at most 1 - ``confidence`` of all certificates.
+    """
+    if failures >= loops:
+        return 1.0
+    return float(beta.ppf(confidence, failures + 1, loops - failures))
+
+
+def loops_without_failure(share: float, confidence: float) -> int:
+    """The fewest loops of which none may fail so that at most ``share`` of all do: (1 - share)^n <= 1 - confidence."""
+    return math.ceil(math.log(1 - confidence) / math.log(1 - share))
