@@ -51,6 +51,7 @@ class History:
         number = seed % len(KINDS)
         self.findings, self.laws = Findings(), laws(number)
         self._known = Operate(())
+        self._sent = np.zeros(0, dtype=bool)  # shape: (n_mv,), sent by hand in this period
         for law in self.laws:
             law.findings = self.findings
         self.plant = MadePlant(KINDS[number], 100 * number, rng, self.findings)
@@ -93,6 +94,7 @@ class History:
     def _before(self, k: int) -> None:
         rng, plant = self.rng, self.plant
         self.findings.scan = k
+        self._sent = np.zeros(len(plant.local), dtype=bool)
         try:
             for act, chance in (
                 (self._operate, 0.15), (self._sp, 0.05), (self._mode, 0.03), (self._hand, 0.05), (self._swap, 0.01),
@@ -120,10 +122,11 @@ class History:
         return self._known
 
     def _theirs(self) -> NDArray[np.bool_]:
-        """The MVs (n_mv,) that operators have in hand, or the plant has: these may move in HOLD."""
+        """The MVs (n_mv,) that may move in HOLD: in hand, sent by hand this period and given back, or the plant's."""
         loop, at = self.loop, self._operated.places
         used = [loop.operate[at[f"{s.name}.use"]] if f"{s.name}.use" in at else 1.0 for s in loop.manifest.mv]
-        return np.array([s.name in loop.local or not u for s, u in zip(loop.manifest.mv, used, strict=True)])
+        out = [s.name in loop.local or not u for s, u in zip(loop.manifest.mv, used, strict=True)]
+        return np.array(out) | self._sent
 
     def _observe(self, sample: Sample | None, command: Command) -> None:
         seen, plant = self.findings.seen, self.plant
@@ -172,6 +175,7 @@ class History:
 
     def _hand(self) -> None:
         self.loop.set_mv([float(self.rng.uniform(s.low, s.high)) for s in self.loop.manifest.mv])
+        self._sent |= self._theirs()
 
     def _swap(self) -> None:
         if self.loop.successor is not None and self.rng.random() < 0.3:
