@@ -324,3 +324,22 @@ def test_every_time_on_the_page_is_in_the_zone_of_its_clock(
     expect(page.locator("body")).not_to_contain_text("UTC")
     assert "GMT+5:30" in str(page.locator("#clock").text_content())
     page.close()
+
+
+def test_the_card_shows_the_certificate_and_its_grounds_on_demand(
+    browser: Browser, loop: FakeLoop, served: tuple[FakeLoop, str, str]
+) -> None:
+    sentence, ground = "of plants like these at most 1 % fail", "not in the family: sensors that fail"
+    card = loop.about["card"]
+    loop.about["card"] = {**card, "certificate": {"lines": [sentence, ground], "wrong": ""}}
+    page = come_in(browser, served)
+    shown = page.locator("#card-body summary", has_text=sentence)
+    expect(shown).to_be_visible()
+    expect(page.get_by_text(ground)).to_be_hidden()
+    shown.click()
+    expect(page.get_by_text(ground)).to_be_visible()
+    page.close()
+    loop.about["card"] = {**card, "certificate": {"lines": ["that of another law"], "wrong": "that of another law"}}
+    page = come_in(browser, served)
+    expect(page.locator("#card-body")).to_contain_text("NOT TO BE BELIEVED: that of another law")
+    page.close()
