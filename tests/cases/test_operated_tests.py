@@ -95,7 +95,7 @@ def test_ranges_at_odds_cannot_both_be_kept_and_the_last_rank_bears_it() -> None
 @pytest.mark.parametrize("noises", [3.0, 12.0, 48.0])
 @pytest.mark.parametrize("aside", [-0.9, 0.0, 0.9])
 def test_every_test_is_one_that_the_law_takes_within_narrow_ranges_of_its_own(noises: float, aside: float) -> None:
-    """An evaporator's level has a default high end: a test had asked for a low end beyond it, and no controller came."""
+    """A test had asked for a low end beyond the high one that an evaporator's level has by default."""
     case = two_lags()
     signals, half = case.plant.pv_signals, noises * case.noise_std
     middle = case.plant.measure(case.plant.start[0]) + aside * half

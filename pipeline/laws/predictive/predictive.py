@@ -118,8 +118,8 @@ class Predictive(ControlLaw):
         bounds = scaled_limits(signals, model, params) if params.operate is None else None
         walls = None if bounds is None else SoftLimits(*bounds, PRICE * max(weights), horizon)
         cost = replace(cost, weights=(*weights, *(0.0 for _ in range(n_o - n_cv))))
-        changes = USUAL_CHANGES if params.changes is None else params.changes
-        bounded = None if params.operate is None else BoundedMinimum(self.moves.count, changes)
+        most = USUAL_CHANGES if params.changes is None else params.changes
+        bounded = None if params.operate is None else BoundedMinimum(self.moves.count, most)
         sweeps = USUAL_SWEEPS if params.sweeps is None else params.sweeps
         self.planner = Planner(run, self.moves, cost, params.passes, sweeps, rate, walls, bounded, valleys=n_mv > n_cv)
         self.wanted = course_of(signals, model, horizon, n_o, bounds, ramp=params.preview == "ramp")
