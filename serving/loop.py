@@ -276,7 +276,7 @@ class ControlLoop:
         taken = np.array([s.name in take for s in signals]) & ~self._active.in_hand
         if taken.any():
             self.set_operate({f"{s.name}.use": 0.0 for s, of in zip(signals, taken.tolist(), strict=True) if of})
-        self._mv.send(wanted, signals, taken)
+        self._mv.send(wanted, signals, taken, self.mode)
 
     def require_in_hand(self, names: Collection[str], take: Collection[str] = ()) -> None:
         """LoopError unless operators have these MVs in hand: all in MANUAL, those of ``use`` 0 in AUTO and HOLD.
@@ -351,7 +351,7 @@ class ControlLoop:
 
         Where the scan has found that the MV stands elsewhere, it stays there.
         """
-        self._mv.unwritten(before, self.mode, self.controller.manifest.mv)
+        self._mv.unwritten(before, self.controller.manifest.mv)
         self._lose(reason)
         self._scan -= 1
         self.courses.passed(-1)  # this scan is counted already
@@ -376,7 +376,7 @@ class ControlLoop:
         self.courses.passed(1)
         back, sp, mv = self._mode.handing_back, self._sp.copy(), self.mv
         command = Command(self._scan - 1, self.mode, sp, mv, law_mv, info, reason, beside, back, local=self.local)
-        self._mv.given(written=command.writes)
+        self._mv.given(self.mode, written=command.writes)
         return command
 
     # ------------------------------------------------------------------ running

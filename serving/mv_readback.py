@@ -90,6 +90,8 @@ class ShownMV(NamedTuple):
     found: Array | None = None  # shape: (n_mv,), where the MV stands, at the scan that learns it after a loss
     silent: str = ""  # why nothing may be written; empty: it may
     outside: bool = False  # the MV stands where the loop may not command it
+    bad: bool = False  # there is a read-back that no actuator can have
+    forgotten: bool = False  # nothing tells any more where the MV stands, and the old one is nothing to go back to
 
 
 class AppliedMV:
@@ -97,9 +99,10 @@ class AppliedMV:
 
     Such a command leaves it unknown where the MV stands: others may move it meanwhile. The next read-back tells, also
     that of a sample which is refused for another reason, and nothing writes an old MV over it. Nothing is written while
-    the read-back is bad, nor, where the MV stands outside its range, until it is back. A plant that reads nothing back
-    gets the old MV. The same holds where a shadow has just ended (``take``): others may have moved the MV since its
-    last sample.
+    the read-back is bad, nor, where the MV stands outside its range, until it is back. A good sample without a
+    read-back says that nothing is read back, and the old MV is written again; not so after a bad read-back, since which
+    the plant is known to have one. A plant that has never had one gets the old MV at once. The same holds where a
+    shadow has just ended (``take``): others may have moved the MV since its last sample.
     """
 
     def __init__(self, signals: Sequence[Signal], mv: Array) -> None:
@@ -107,7 +110,8 @@ class AppliedMV:
         self._ranges = [(s.low, s.high, s.values) for s in signals]
         self._standing = StandingMv(signals, mv)
         self._given, self._written = mv, False  # shape: (n_mv,), the last command, and whether it went to the plant
-        self._is_read = False  # whether the plant has ever read it back
+        self._is_read = False  # whether any sample has ever had a read-back, sound or not
+        self._doubted = False  # since nobody knows where the MV stands, a read-back was bad
         self._taken = False  # whether others had the MV until now, and no sample has told since where it stands
 
     @property
@@ -123,12 +127,6 @@ class AppliedMV:
     def take(self, taken: bool) -> None:
         """``taken``: others had the MV until now."""
         self._taken = taken
-
-    def untold(self, *, is_read: bool = False) -> str:
-        """Why nothing may be written where no sample tells; empty: it may. ``is_read``: the plant reads back now."""
-        if not (self._is_read or is_read):
-            return ""
-        return UNREAD if self.lost else UNTOLD if self._taken else ""
 
     def lose(self) -> None:
         """The last command did not arrive."""
@@ -156,14 +154,16 @@ class AppliedMV:
         try:
             applied = None if sample.mv_applied is None else self.read_back(sample, last)
         except Exception:  # no sample, or no MV that any actuator can have
-            return self._unread(sample)
+            return self.unread(sample)
         if applied is not None:
+            self._doubted = self._doubted and refused and not (self.lost or self._taken)
             self._is_read, self._taken = True, False
             return ShownMV(applied, self._standing.seen(applied))
         if refused:
-            return self._unread(sample)
+            return self.unread(sample)
+        forgotten, self._doubted = self._doubted, False
         self._standing.lost = self._taken = False
-        return ShownMV()
+        return ShownMV(forgotten=forgotten)
 
     def read_back(self, sample: Sample, last: Array) -> Array:
         """The applied MV (n_mv,) within its range; the last command if there is no read-back.
@@ -195,19 +195,25 @@ class AppliedMV:
         """The command (n_mv,) that keeps each MV where it stands by its read-back, an actuator's offset apart."""
         return self._standing.at(applied)
 
-    def _unread(self, sample: Sample) -> ShownMV:
-        """No sound read-back: nothing is written after a loss or a take-over, unless the plant never reads back."""
+    def unread(self, sample: Sample | None = None) -> ShownMV:
+        """No sound read-back, or no sample: nothing is written after a loss or a take-over."""
+        bad = getattr(sample, "mv_applied", None) is not None
+        self._is_read = self._is_read or bad
+        if not self._is_read:  # nothing would ever tell more
+            self._standing.lost = self._taken = False
         if not (self.lost or self._taken):
-            return ShownMV()
+            return ShownMV(bad=bad)
+        self._doubted = self._doubted or bad
         outside = self._outside(sample)
         if outside:
-            return ShownMV(silent=reworded(outside, f"{outside}: nothing is written before it is back"), outside=True)
-        return ShownMV(silent=self.untold(is_read=getattr(sample, "mv_applied", None) is not None))
+            words = reworded(outside, f"{outside}: nothing is written before it is back")
+            return ShownMV(silent=words, outside=True, bad=True)
+        return ShownMV(silent=UNREAD if self.lost else UNTOLD, bad=bad)
 
-    def _outside(self, sample: Sample) -> str:
+    def _outside(self, sample: Sample | None) -> str:
         """Why no loop can have commanded the MV that the plant has; empty where the sample does not tell."""
         with suppress(Exception):  # no sample, or no MV at all
-            applied = np.array(sample.mv_applied, dtype=np.float64, ndmin=1)
+            applied = np.array(getattr(sample, "mv_applied", None), dtype=np.float64, ndmin=1)
             if applied.shape == self._given.shape and np.isfinite(applied).all():
                 return implausible(self._signals, applied.tolist()) or ""
         return ""

@@ -47,7 +47,7 @@ def read_all(row: Mapping[str, Any], where: str) -> dict[str, Array]:
 
 
 # ------------------------------------------------------------------------------------------------------------- the kit
-KIT = 5  # version of the format: 4 had no scan in SHADOW, and up to 3 no step said from which state it starts
+KIT = 6  # version of the format: 5 had no set_mv, 4 no scan in SHADOW, and up to 3 no step gave its state
 VECTORS = "vectors.json"
 KIT_TOLERANCE = 1e-9  # share of an entry's scale, in one step from the kit's state: WebAssembly differs by up to 3e-10
 CHAIN_TOLERANCE = 1e-6  # share of an entry's scale, chained: a thousandfold before the chain begins again
@@ -68,7 +68,16 @@ PASS = (
     "missed: so many periods passed before the scan without one.",
     "unwritten = true: the command of the scan before did not reach the plant; your loop learns it before this scan. "
     "Somebody may have moved the MV: the next sound read-back is where it stands, also by hand and in a sample that is "
-    "refused for another reason. Without any read-back the MV before that command stays.",
+    "refused for another reason. A good sample without any read-back says that there is none: the MV before that "
+    "command stays. After a bad read-back there is none to go back to, and nothing is written. A plant of which no "
+    "sample has ever had a read-back gets the MV before that command at once.",
+    "set_mv: the operator sends the MV there. Your loop refuses it but in MANUAL, after a command that did not arrive, "
+    "and outside the range. It goes there by at most max_move a period, at once without one. Where it is not known "
+    "where the MV stands, it begins at the scan, from its read-back; without a read-back the MV is where it was sent, "
+    "and a bad one ends the way. A way by hand goes on after a command that did not arrive, unless a read-back tells "
+    "where the MV stands; another mode ends it.",
+    "Before a scan the order is set_mode, set_mv, unwritten, missed. unwritten is about the scan before, whatever has "
+    "been set since.",
     "set_mode = SHADOW: others command. Nothing is written (mv = null), and the law is stepped on what is read back. "
     "Once another mode is set, others may have moved the MV since the last sample: the next sound read-back is where "
     "it stands, also in a sample that is refused for another reason, and nothing is written before it. A good sample "
@@ -151,7 +160,7 @@ def vectors_of(controller: Controller) -> dict[str, Any]:
             "read_back_margin": READ_BACK_MARGIN.hex(),
             "max_age_s": m.period_s.hex(),
         },
-        "scans": [_scan_row(row) for row in scans],
+        "scans": [scan_row(row) for row in scans],
     }
 
 
@@ -175,11 +184,13 @@ def _step_row(inputs: tuple[str, ...], answer: StepResult, begins: bool) -> dict
     return row | {"gives": {"mv": written(mv), "state_next": written(state), "info": written(info)}}
 
 
-def _scan_row(row: Scanned) -> dict[str, Any]:
+def scan_row(row: Scanned) -> dict[str, Any]:
+    """A scan and this runtime's command as a row of ``scans``."""
     scan, command = row.scan, row.command
     return {
         "what": scan.what,
         "set_mode": None if scan.set_mode is None else str(scan.set_mode),
+        "set_mv": None if scan.set_mv is None else written(scan.set_mv),
         "unwritten": scan.unwritten,
         "missed": scan.missed,
         "sample": None if scan.sample is None else _sample_row(scan.sample),

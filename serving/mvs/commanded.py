@@ -48,6 +48,7 @@ class CommandedMV:
         self.now, self.out = mv, out
         self.found: Array | None = None
         self._stood: Array | None = None  # shape: (n_mv,), the same, and where others had moved it until now
+        self._hand = False  # the last command is an operator's, in MANUAL then and ever since
         self._plant = AppliedMV(signals, mv)
 
     @property
@@ -74,10 +75,12 @@ class CommandedMV:
     def begun(self, mode: Mode, before: Mode, in_hand: Those) -> None:
         """Somebody changes the mode ``before``; MVs ``in_hand`` (n_mv,) stay so."""
         self.out.begun(mode, in_hand)
+        self._hand = False
         self._plant.take(mode is not Mode.SHADOW and (self._plant.taken or before is Mode.SHADOW))
 
-    def send(self, wanted: Array, signals: tuple[Signal, ...], taken: Those) -> None:
+    def send(self, wanted: Array, signals: tuple[Signal, ...], taken: Those, mode: Mode) -> None:
         """Begin the way to ``wanted`` (n_mv,), of those ``taken`` (n_mv,) out of use with it from the next scan on."""
+        self._hand = self._hand or mode is Mode.MANUAL
         self.now = self.out.hand.sent(self.now, wanted, signals, taken, untold=self._plant.taken)
 
     def require_arrived(self) -> None:
@@ -99,9 +102,11 @@ class CommandedMV:
         blind = self.out.hand.wanted is not None and not self.known  # on a way by hand from nobody knows where
         if shown.applied is not None and (taken or blind):
             self.now = self._stood = shown.applied.copy()
+        if shown.bad and (shown.silent or blind):
+            self.out.hand.wanted = None  # the way by hand would begin nobody knows where
+        if shown.outside or shown.forgotten:
+            self.now = self._stood = np.full(len(self.now), nan)
         if shown.silent:
-            if shown.outside:  # the way by hand would begin nobody knows where
-                self.now, self.out.hand.wanted = np.full(len(self.now), nan), None
             doubled = not reason or shown.silent.startswith(reason)
             return shown if doubled else shown._replace(silent=reworded(reason, f"{reason}; {shown.silent}"))
         if self.found is not None:
@@ -113,7 +118,7 @@ class CommandedMV:
         """A scan without a sample: why nothing may be written; empty: it may."""
         self._plant.arrived()
         self.found = self._stood = None
-        silent = self._plant.untold()
+        silent = self._plant.unread().silent
         if not silent:
             self._follow(None, mode, in_hand)
         return silent
@@ -141,14 +146,17 @@ class CommandedMV:
         if moves and mode.overdue:
             self.now = self.out.without(self.now, mode.safe(self.now, signals))
 
-    def given(self, *, written: bool) -> None:
+    def given(self, mode: Mode, *, written: bool) -> None:
         """A scan ends with the command of ``now``, ``written`` to the plant or not."""
+        self._hand = mode is Mode.MANUAL
         self._plant.command(self.now, written=written)
         self.out.local.commanded(self.now, written=written)
 
-    def unwritten(self, before: Array, mode: Mode, signals: tuple[Signal, ...]) -> None:
-        """The last command did not reach the plant: the MVs stay where they were ``before`` it, or were found."""
+    def unwritten(self, before: Array, signals: tuple[Signal, ...]) -> None:
+        """The last command did not reach the plant: the MVs stay where they were ``before`` it, or were found.
+
+        Those that an operator sent somewhere go there from where they stand.
+        """
         stands = np.array(before if self._stood is None else self._stood, dtype=np.float64)
-        by_hand = mode is Mode.MANUAL and self.out.hand.wanted is None  # where it should be is where it goes
-        self.now = self.out.hand.sent(stands, self.now, signals) if by_hand else stands
+        self.now = self.out.hand.sent(stands, self.goal, signals) if self._hand else stands
         self._plant.lose()

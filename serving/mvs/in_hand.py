@@ -18,7 +18,7 @@ class ByHand:
     """Where an operator sent the MVs, and the way there: each by at most its ``max_move`` a period, as with any law.
 
     It counts from the last command, which also a plant without a read-back has. Where nobody knows where the MV
-    stands, it is where the operator says.
+    stands, it is where the operator says, once a scan shows no read-back; a bad one ends the way.
     """
 
     def __init__(self) -> None:
@@ -30,13 +30,11 @@ class ByHand:
         """Begin the way to ``wanted`` (n_mv,); the MV from now on, which is there already where it is not limited.
 
         Those ``taken`` (n_mv,) out of use with it begin at the next scan, which shows where they stand; and all, where
-        others had them until now and nothing has told where they stand (``untold``).
+        nobody knows where they stand, or others had them until now and nothing has told since (``untold``).
         """
         limited = np.array([s.most < np.inf for s in signals])
         limited = limited if taken is None else limited | taken
-        if untold or (
-            limited.any() and np.isnan(mv).any()
-        ):  # not known where they stand: nothing is written until it is
+        if untold or np.isnan(mv).any():
             limited[:] = True
         self.wanted = np.where(limited, wanted, np.nan)
         self._end()

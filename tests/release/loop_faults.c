@@ -9,8 +9,8 @@
 
 /* Nobody told where the MV stands: nothing may be written until the plant says so. */
 static int start(Controller *c) {
-  double pv[2] = {0.4, 300}, mv[1] = {200};
-  Sample good_one = {pv, NULL, mv, 0.0}, no_read_back = {pv, NULL, NULL, 0.0};
+  double pv[2] = {0.4, 300}, mv[1] = {200}, beyond[1] = {600};
+  Sample good_one = {pv, NULL, mv, 0.0}, no_read_back = {pv, NULL, NULL, 0.0}, outside = {pv, NULL, beyond, 0.0};
   Loop l;
   MUST(loop_open(&l, c, AUTO, 2) && !loop_writes(&l));
   loop_scan(&l, NULL);
@@ -29,7 +29,14 @@ static int start(Controller *c) {
   loop_scan(&l, &good_one);
   MUST(l.mode == AUTO && loop_writes(&l) && l.mv[0] == c->out[OUT_MV][0] && l.mv[0] != 200);
   loop_close(&l);
-  MUST(loop_open(&l, c, MANUAL, 2) && loop_set(&l, MV, mv) && loop_writes(&l)); /* the operator's own */
+  MUST(loop_open(&l, c, MANUAL, 2) && loop_set(&l, MV, mv) && !loop_writes(&l));
+  loop_scan(&l, &no_read_back);
+  MUST(loop_writes(&l) && l.mv[0] == 200); /* the operator's own, once no read-back speaks against it */
+  loop_close(&l);
+  MUST(loop_open(&l, c, MANUAL, 2) && loop_set(&l, MV, mv));
+  loop_scan(&l, &outside);
+  loop_scan(&l, &no_read_back);
+  MUST(!loop_writes(&l)); /* the plant reads back, and it stands elsewhere */
   loop_close(&l);
   MUST(loop_open(&l, c, AUTO, 2) && loop_set(&l, MV, mv) && loop_writes(&l)); /* or what the plant has at the start */
   loop_close(&l);

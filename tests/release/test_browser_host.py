@@ -50,7 +50,7 @@ def test_the_browser_does_not_pass_a_damaged_kit(page: Page, damage: str, tmp_pa
 
 def test_the_browser_refuses_an_old_kit(page: Page, tmp_path: Path) -> None:
     said = conform(page, spoilt(PID, tmp_path, an_old_version))
-    assert said == "error: the kit has the version 3, not 5: write it again with loopwright conformance FILE.onnx KIT\n"
+    assert said == "error: the kit has the version 3, not 6: write it again with loopwright conformance FILE.onnx KIT\n"
 
 
 def test_the_browser_s_loop_scans_once_a_period(page: Page) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections import Counter
@@ -231,18 +232,38 @@ def test_the_scans_hold_what_the_guards_refuse(vectors: Json) -> None:
     assert [row["missed"] for row in vectors["scans"] if row["missed"]] == [1, 3, 4]
 
 
+def part(rows: list[Json], words: str) -> int:
+    """Where the scans with these words begin."""
+    return next(k for k, row in enumerate(rows) if row["what"].startswith(words))
+
+
+def test_the_scans_hold_what_an_operator_sends(vectors: Json) -> None:
+    """In each mode, and around lost commands; a PLC sees a request by its edge, so no two follow each other."""
+    rows = vectors["scans"]
+    sends = [k for k, row in enumerate(rows) if row["set_mv"] is not None]
+    assert all(b - a > 1 for a, b in itertools.pairwise(sends))
+    taken = {k for k in sends if rows[k]["mv"] == rows[k]["set_mv"]}
+    assert {rows[k]["mode"] for k in taken} == {"MANUAL"}
+    assert {rows[k]["mode"] for k in sends} == {"MANUAL", "HOLD", "AUTO"}
+    assert len(taken) > 5
+    assert (
+        sum(rows[k]["mv"] is None for k in sends) == 2 + 2 + 1
+    )  # from nowhere known, after others, and while it is lost
+    assert sum(rows[k]["unwritten"] for k in sends) == 1
+    changed = [row for row in rows if row["unwritten"] and row["set_mode"]]
+    assert [row["set_mode"] for row in changed] == ["MANUAL", "MANUAL", "AUTO"]
+
+
 def test_the_scans_begin_without_information(pi_file: Path, vectors: Json) -> None:
     """Nothing is written until a good sample with a read-back; the loop begins from there, and not from the middle."""
     assert vectors["loop"]["mv"] is None
     rows = vectors["scans"]
-    known = next(k for k, row in enumerate(rows) if row["mv"] is not None)
-    assert [row["what"] for row in rows[:known]] == [
-        "the plant cannot be read at first",
-        "a PV at first not finite",
-        "an applied MV at first not finite",
-        "no read-back at first",
-    ]
-    assert all(row["fault"] and row["mode"] == "HOLD" for row in rows[:known])
+    sent, known = part(rows, "by hand, before"), part(rows, "the first good sample")
+    assert all(row["fault"] and row["mode"] == "HOLD" and row["mv"] is None for row in rows[:sent])
+    assert rows[sent]["mv"] == rows[sent]["set_mv"]  # nobody but the operator knows
+    again = part(rows, "no read-back after a bad one")  # not known again
+    assert all(row["fault"] and row["mv"] is None for row in rows[again:known])
+    assert {bool(row["sample"]) for row in rows[again:known]} == {True, False}
     assert rows[known]["mv"] == rows[known]["sample"]["mv_applied"]
     (valve,) = Controller(pi_file).manifest.mv
     assert float.fromhex(rows[known]["mv"][0]) != valve.middle
@@ -255,6 +276,7 @@ def test_the_scans_begin_without_information(pi_file: Path, vectors: Json) -> No
 def test_the_scans_hold_commands_that_did_not_arrive(vectors: Json) -> None:
     """The loop goes on from where the MV stands, in each mode, and not from where the lost command left it."""
     rows = vectors["scans"]
+    rows = rows[part(rows, "the first good sample") : part(rows, "sent by hand in AUTO")]
     lost = [k for k, row in enumerate(rows) if row["unwritten"]]
     found = {k: rows[k] for k in lost if rows[k]["sample"] and rows[k]["sample"]["mv_applied"] is not None}
     assert [rows[k]["mode"] for k in lost] == ["HOLD", "HOLD", "HOLD", "MANUAL", "HOLD", "HOLD"]
@@ -273,6 +295,7 @@ def test_the_scans_hold_commands_that_did_not_arrive(vectors: Json) -> None:
 def test_the_scans_hold_what_others_command(vectors: Json) -> None:
     """Nothing is written in SHADOW, nor after it before a sample tells; then never the MV of a scan before."""
     rows = vectors["scans"]
+    rows = rows[: part(rows, "sent by hand in AUTO")]
     shadow = [k for k, row in enumerate(rows) if row["mode"] == "SHADOW"]
     assert all(rows[k]["mv"] is None for k in shadow)
     ends = [k + 1 for k in shadow if rows[k + 1]["mode"] != "SHADOW"]
@@ -292,7 +315,7 @@ def test_the_scans_hold_what_others_command(vectors: Json) -> None:
     assert silent == 1 + 2 * 3
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4])
+@pytest.mark.parametrize("version", [1, 2, 3, 4, 5])
 def test_an_old_kit_is_one_line_that_says_what_to_do(
     pi_file: Path, vectors: Json, answers: Json, tmp_path: Path, capsys: Capture, version: int
 ) -> None:
@@ -303,7 +326,7 @@ def test_an_old_kit_is_one_line_that_says_what_to_do(
     path.write_text(json.dumps(answers))
     assert main(["conformance", str(pi_file), str(tmp_path), "--check", str(path)]) == 2
     said = capsys.readouterr().err
-    assert f"{VECTORS} has the version {version}; this release reads 5: write it again with" in said
+    assert f"{VECTORS} has the version {version}; this release reads 6: write it again with" in said
     assert said.count("\n") == 1
 
 
@@ -481,8 +504,8 @@ def test_one_bit_is_seen(pi_file: Path, kit: Path, answers: Json, tmp_path: Path
         (lambda a: a["scans"].pop(), "are answered instead of"),
         (lambda a: a["steps"][7]["mv"].append("0x0p+0"), "step 7 (anywhere): mv: 2 numbers instead of 1"),
         (lambda a: a["scans"][5]["mv"].append("0x0p+0"), "mv: 2 numbers instead of 1"),
-        (lambda a: a["scans"][5].update(mode="AUTO"), "mode is 'AUTO', but must be 'HOLD'"),
-        (lambda a: a["scans"][5].update(fault=False), "fault is False, but must be True"),
+        (lambda a: a["scans"][11].update(mode="AUTO"), "mode is 'AUTO', but must be 'HOLD'"),
+        (lambda a: a["scans"][11].update(fault=False), "fault is False, but must be True"),
         (lambda a: a["scans"][0].update(mv=a["scans"][4]["mv"]), "an MV is written, but where it stands is not known"),
         (lambda a: a["scans"][4].update(mv=None), "no MV is written, but one must be"),
     ],

@@ -147,7 +147,7 @@ def test_python_s_conformance_run_refuses_an_old_kit(tmp_path: Path) -> None:
     command = [sys.executable, str(EXAMPLES / "conformance.py"), str(kit)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
     assert done.returncode == 1
-    assert done.stderr == f"{kit} has the version 3, not 5: write it again with loopwright conformance FILE.onnx KIT\n"
+    assert done.stderr == f"{kit} has the version 3, not 6: write it again with loopwright conformance FILE.onnx KIT\n"
 
 
 def test_the_example_loop_runs_once_a_period_and_begins_where_the_plant_is() -> None:

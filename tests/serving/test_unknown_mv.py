@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from loopwright.pipeline.export.gate import export
 from loopwright.serving import Controller, ControlLoop, EndpointError, Fallback, Mode, Sample, VirtualClock
 
 pytest_plugins = ["small_laws"]
@@ -189,3 +191,76 @@ def test_a_way_by_hand_ends_where_the_mv_is_read_back_outside_its_range(pi_file:
     assert not loop.scan(sample(mv=200.0)).writes
     assert not loop.scan(sample(mv=None)).writes
     assert loop.scan(sample(mv=STANDS + 8)).mv.tolist() == [STANDS + 8]
+
+
+# ------------------------------------------------------------------------------------- by hand, and what did not arrive
+def rated_loop(make_formula: Any, pi_law: Any, tmp_path: Path, **options: Any) -> ControlLoop:
+    """Of a law that leaves its MV where it is; the MV moves by 4 a period."""
+    signals = replace(pi_law.signals, mv=(replace(pi_law.signals.mv[0], max_move=4.0),))
+    path = tmp_path / "rated.onnx"
+    export(
+        make_formula(lambda law, sp, pv, dv, mv, state: (mv, state, pv), 1, ("a", "b"), signals),
+        path,
+        case="x",
+        provenance={},
+    )
+    return ControlLoop(Controller(path), **{"sp": 0.8, "mode": Mode.MANUAL, "recover_after": 2, **options})
+
+
+@pytest.mark.parametrize("rated", [False, True])
+@pytest.mark.parametrize("bad", [200.0, math.nan])
+def test_by_hand_from_nowhere_known_a_bad_read_back_ends_the_way(
+    rated: bool, bad: float, pi_file: Path, make_formula: Any, pi_law: Any, tmp_path: Path
+) -> None:
+    loop = rated_loop(make_formula, pi_law, tmp_path) if rated else loop_on(pi_file, mode=Mode.MANUAL)
+    loop.set_mv([20.0])
+    assert not loop.scan(sample(mv=bad)).writes
+    assert not loop.scan(sample(mv=None)).writes
+    loop.set_mv([20.0])
+    assert loop.scan(sample(mv=None)).mv.tolist() == [20.0]  # nobody but the operator says where it is
+
+
+@pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD, Mode.AUTO])
+def test_after_a_bad_read_back_a_lost_command_leaves_no_mv_to_go_back_to(mode: Mode, pi_file: Path) -> None:
+    loop = loop_on(pi_file, mode=mode)
+    before = loop.scan(sample()).mv
+    loop.scan(sample())
+    loop.unwritten(before, "no way")
+    assert not loop.scan(sample(mv=math.nan)).writes
+    assert not loop.scan(sample(mv=None)).writes
+    assert loop.scan(sample(mv=STANDS + 8)).mv.tolist() == [STANDS + 8]
+
+
+def test_a_plant_that_was_never_read_back_gets_the_old_mv_at_once(pi_file: Path) -> None:
+    loop = loop_on(pi_file, mv=[STANDS], mode=Mode.HOLD)
+    loop.scan(sample(mv=None))
+    loop.unwritten(loop.mv, "no way")
+    assert loop.miss("no route").mv.tolist() == [STANDS]
+    loop.unwritten(loop.mv, "no way")
+    assert loop.scan(sample(math.nan, mv=None)).mv.tolist() == [STANDS]
+
+
+def test_a_command_of_the_law_that_did_not_arrive_is_none_of_an_operator(pi_file: Path) -> None:
+    """Though MANUAL is set before the loop hears of it."""
+    loop = loop_on(pi_file, sp=0.9)
+    loop.scan(sample())
+    before = loop.mv
+    assert loop.scan(sample(0.7)).mv.tolist() != before.tolist()
+    loop.set_mode(Mode.MANUAL)
+    loop.unwritten(before, "no way")
+    assert loop.scan(sample(mv=None)).mv.tolist() == before.tolist()
+
+
+@pytest.mark.parametrize("mode", [Mode.HOLD, Mode.AUTO])
+def test_a_way_by_hand_that_did_not_arrive_ends_with_the_mode(
+    mode: Mode, make_formula: Any, pi_law: Any, tmp_path: Path
+) -> None:
+    loop = rated_loop(make_formula, pi_law, tmp_path)
+    loop.scan(sample())
+    before = loop.mv
+    loop.set_mv([STANDS + 3])
+    assert loop.scan(sample()).mv.tolist() == [STANDS + 3]
+    loop.unwritten(before, "no way")
+    assert loop.mv_wanted.tolist() == [STANDS + 3]
+    loop.set_mode(mode)
+    assert loop.scan(sample(mv=None)).mv.tolist() == [STANDS]

@@ -48,8 +48,8 @@ async function medianStep(controller, given) {
 
 // {answers, words, passed}: the answers for `loopwright conformance FILE OUT --check`, and the result in words.
 export async function conform(ort, provider, bytes, manifest, vectors, host, version) {
-  if (vectors.kit !== 5)
-    throw new Error(`the kit has the version ${vectors.kit}, not 5: write it again with loopwright conformance FILE.onnx KIT`);
+  if (vectors.kit !== 6)
+    throw new Error(`the kit has the version ${vectors.kit}, not 6: write it again with loopwright conformance FILE.onnx KIT`);
   const controller = await Controller.load(ort, bytes, manifest, provider);
   if (manifest.sha256 !== vectors.sha256) throw new Error("the vectors are of another controller file");
   const scale = Object.fromEntries(OUTPUTS.map((name) => [name, numbers(vectors.scale[name])]));
@@ -92,6 +92,11 @@ export async function conform(ort, provider, bytes, manifest, vectors, host, ver
   const scans = [];
   for (const row of vectors.scans) {
     if (row.set_mode) loop.setMode(row.set_mode);
+    try {
+      if (row.set_mv) loop.setMv(numbers(row.set_mv));
+    } catch (error) {
+      if (!(error instanceof Refused)) throw error; // it may have to be refused
+    }
     if (row.unwritten) loop.unwritten("the plant cannot be written"); // the command of the scan before
     if (row.missed) loop.gap(row.missed);
     const { pv, dv, mv_applied, age_s } = row.sample ?? {};

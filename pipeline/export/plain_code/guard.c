@@ -194,16 +194,17 @@ static int to_come_allowed(const lower_loop *l, const double *dv)
 
 /* Where the MV stands after a command that did not arrive, and after others had it: at the next sound read-back, also of a
    sample that is refused for another reason. A good sample without one says that nothing is read back: the MV before it
-   stays. */
+   stays, also at once where there has never been a read-back. After a bad one it is nothing to go back to. */
 static void find(lower_loop *l, const lower_sample *s, int good_one)
 {
-    const int back = s->has_mv_applied;
+    const int back = s != NULL && s->has_mv_applied;
     const int sound = back && implausible(s->mv_applied) == UPPER_N_MV;
-    const int blind = sound && l->by_hand && !l->known; /* until now on a way by hand from nobody knows where */
-    if (!(l->lost || l->taken || blind) || !(back || good_one)) {
+    const int blind = l->by_hand && !l->known; /* on a way by hand from nobody knows where */
+    l->is_read = l->is_read || back;
+    if (!(l->lost || l->taken || blind) || !(back || good_one || !l->is_read)) {
         return;
     }
-    l->by_hand = l->by_hand && !(back && (l->lost || (l->taken && !sound))); /* it stays where it is found */
+    l->by_hand = l->by_hand && !(back && (l->lost || !sound)); /* it stays where it is found */
     l->known = back ? sound : l->known;
     l->lost = l->lost && back && !sound;
     l->taken = l->taken && back && !sound;
@@ -276,6 +277,20 @@ static void move_by_hand(lower_loop *l)
     l->by_hand = !there;
 }
 
+/* Begin the way to where an operator wants the MV. One whose moves are not limited is there, unless all wait for a scan that
+   tells where they stand. */
+static void send(lower_loop *l, int wait)
+{
+    l->by_hand = 0;
+    for (int k = 0; k < UPPER_N_MV; ++k) {
+        if (wait || UPPER_MV_MAX_MOVE[k] > 0.0) {
+            l->by_hand = 1;
+        } else {
+            l->mv[k] = l->wanted[k];
+        }
+    }
+}
+
 static void missed(lower_loop *l, double periods)
 {
     for (int k = 0; k < UPPER_N_PV; ++k) {
@@ -286,6 +301,7 @@ static void missed(lower_loop *l, double periods)
 static void take(lower_loop *l, const lower_sample *s)
 {
     int good_one = 0;
+    int said;
     int k;
     const double *pv = s != NULL ? s->pv : l->pv;
     if (s == NULL) {
@@ -302,13 +318,14 @@ static void take(lower_loop *l, const lower_sample *s)
         pv = l->pv;
     }
 #endif
-    if (s != NULL) {
-        find(l, s, good_one);
-    }
+    find(l, s, good_one);
+    l->was_known = l->known;
+    said = l->by_hand && !l->known && !l->lost && !l->taken && !(s != NULL && s->has_mv_applied);
     for (k = 0; k < UPPER_N_MV; ++k) {
         l->before[k] = l->mv[k];
+        l->mv[k] = said ? l->wanted[k] : l->mv[k]; /* nobody but the operator says where it is */
     }
-    l->was_known = l->known;
+    l->known = l->known || said;
     if (s == NULL || !good_one) {
         return;
     }
@@ -392,6 +409,8 @@ void lower_begin(lower_loop *l, lower_mode mode, long recover_after)
     l->lost = 0;
     l->taken = 0;
     l->by_hand = 0;
+    l->hand = 0;
+    l->is_read = 0;
     l->known = 0;
     l->was_known = 0;
     l->max_gap = 3.0;
@@ -427,25 +446,27 @@ int lower_set_mv(lower_loop *l, const double *mv)
             return 0;
         }
     }
-    l->by_hand = 0;
-    for (k = 0; k < UPPER_N_MV && l->mode == UPPER_MANUAL; ++k) {
-        l->by_hand = l->by_hand || UPPER_MV_MAX_MOVE[k] > 0.0;
-    }
     for (k = 0; k < UPPER_N_MV; ++k) {
-        if (l->by_hand) {
-            l->wanted[k] = mv[k];
-        } else {
+        l->wanted[k] = mv[k];
+    }
+    l->hand = l->mode == UPPER_MANUAL;
+    if (l->hand) {
+        send(l, l->taken || !l->known);
+    } else { /* the operator says where it stands */
+        for (k = 0; k < UPPER_N_MV; ++k) {
             l->mv[k] = mv[k];
         }
+        l->known = 1;
+        l->taken = 0;
+        l->by_hand = 0;
     }
-    l->known = l->known || !l->by_hand;
-    l->taken = l->taken && l->by_hand; /* else it is where it was sent */
     return 1;
 }
 
 void lower_set_mode(lower_loop *l, lower_mode mode)
 {
     l->by_hand = l->by_hand && l->mode == mode;
+    l->hand = l->hand && l->mode == mode;
     l->taken = mode != UPPER_SHADOW && (l->taken || l->mode == UPPER_SHADOW);
     l->mode = mode;
     l->held = 0;
@@ -481,26 +502,25 @@ void lower_gap(lower_loop *l, double periods)
 
 void lower_unwritten(lower_loop *l)
 {
-    const int back = l->mode != UPPER_MANUAL || l->by_hand; /* else where it should be is where it goes */
-    for (int k = 0; k < UPPER_N_MV && back; ++k) {
+    const int goes = l->hand && (l->known || l->by_hand);
+    for (int k = 0; k < UPPER_N_MV; ++k) {
+        l->wanted[k] = l->by_hand ? l->wanted[k] : l->mv[k];
         l->mv[k] = l->before[k];
     }
-    l->known = back ? l->was_known : l->known;
+    l->known = l->was_known;
+    if (goes) { /* where it should be is where it goes, from where it stands */
+        send(l, !l->known);
+    }
     l->lost = 1;
     fail(l, UPPER_NOT_WRITTEN, 0);
 }
 
 int lower_scan(lower_loop *l, const lower_sample *s)
 {
-    if (l->by_hand && !l->known && (s == NULL || !s->has_mv_applied)) { /* nobody but the operator says where it is */
-        for (int k = 0; k < UPPER_N_MV; ++k) {
-            l->mv[k] = l->wanted[k];
-        }
-        l->known = 1;
-    }
     take(l, s);
     if (l->by_hand && lower_writes(l)) {
         move_by_hand(l);
     }
+    l->hand = l->mode == UPPER_MANUAL;
     return lower_writes(l);
 }

@@ -68,7 +68,9 @@ typedef struct {
     int was_known; /* before the last scan */
     int lost;
     int taken; /* others had the MV until now, and no sample has told since where it stands */
-    int by_hand;
+    int by_hand; /* the MV is on its way to where an operator sent it */
+    int hand;    /* the MV of the last scan is an operator's, in MANUAL since then */
+    int is_read; /* a sample has had a read-back, sound or not */
 } lower_loop;
 
 /* Begin without a past, set points in the middle of their ranges. Nothing is written until a good sample says where the
@@ -81,14 +83,15 @@ int lower_scan(lower_loop *l, const lower_sample *s);
 /* Before the next scan: so many periods passed without one. */
 void lower_gap(lower_loop *l, double periods);
 
-/* Before the next scan: the last MV did not reach the plant. */
+/* Before the next scan: the MV of the last one did not reach the plant. Best before lower_set_mode and lower_set_mv. */
 void lower_unwritten(lower_loop *l);
 
 /* After SHADOW nothing is written until a sound read-back, or a good sample without one, says where others left the MV. */
 void lower_set_mode(lower_loop *l, lower_mode mode);
 
 /* Each returns 0, and changes nothing, where a value is not allowed. An MV is the operator's in MANUAL only; it goes to
-   where it is sent by at most its largest change a period. */
+   where it is sent by at most its largest change a period. Where nobody knows where it stands, it begins at the next scan:
+   from a read-back, or at once where there is none; a bad one ends it. */
 int lower_set_sp(lower_loop *l, const double *sp);
 int lower_set_mv(lower_loop *l, const double *mv);
 #if UPPER_N_OPERATE > 0

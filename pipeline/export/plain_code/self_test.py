@@ -96,7 +96,9 @@ def _scan(row: Mapping[str, Any]) -> str:
     read = {n: sample.get(n) for n in ("pv", "dv", "mv_applied")}
     lists = ", ".join(map(_list, read.values()))
     mode = MODES.index(Mode(row["set_mode"])) if row["set_mode"] else -1
-    before = f"{mode}, {int(row['unwritten'])}, {number(float(row['missed']))}, {int(row['sample'] is not None)}"
+    sent = f"{int(row['set_mv'] is not None)}, {_list(row['set_mv'])}"
+    missed = number(float(row["missed"]))
+    before = f"{mode}, {sent}, {int(row['unwritten'])}, {missed}, {int(row['sample'] is not None)}"
     inputs = f"{{{lists}, {int(bool(read['mv_applied']))}, {_any(sample['age_s'])}}}"
     after = f"{MODES.index(Mode(row['mode']))}, {int(row['fault'])}, {int(row['mv'] is not None)}, {_list(row['mv'])}"
     return f"    {{{before}, {inputs}, {after}}} /* {row['what'].replace('*/', '* /')} */"
@@ -142,10 +144,13 @@ static const uint64_t SAME_BITS = UINT64_C({hash});
 #define NO_NUMBER 1.25e308
 #define INFINITE 1.5e308
 
-/* Before a scan: the mode that the operator sets, or -1; whether the last command did not arrive; periods without a
-   scan; whether there is a sample. After it: mode, whether there is a fault, whether the MV is written, the MV. */
+/* Before a scan: the mode that the operator sets, or -1; whether and where the operator sends the MV; whether the last
+   command did not arrive; periods without a scan; whether there is a sample. After it: mode, whether there is a fault,
+   whether the MV is written, the MV. */
 static const struct {{
     int set_mode;
+    int sends;
+    double sent[{upper}_N_MV];
     int unwritten;
     double missed;
     int is_read;
@@ -214,6 +219,9 @@ static int scans_differ(void)
         s.age_s = kit_number(s.age_s);
         if (SCAN[k].set_mode >= 0) {{
             {lower}_set_mode(&l, ({lower}_mode)SCAN[k].set_mode);
+        }}
+        if (SCAN[k].sends) {{
+            (void){lower}_set_mv(&l, SCAN[k].sent); /* it may have to be refused */
         }}
         if (SCAN[k].unwritten) {{
             {lower}_unwritten(&l);

@@ -44,7 +44,8 @@ def printed_vectors_program(m: Manifest, name: str, step: StepBlock, kit: KitInC
     tables.append(f"    tolerance : {array_of('LREAL', [CHAIN_TOLERANCE * (s.high - s.low) for s in m.mv])};")
     now = [f"    now_{n} : ARRAY[0..{v.shape[1] - 1}] OF LREAL;" for n, v in given.items()]
     read = ["pv", "mv_applied", *(["dv"] if "dv" in m.inputs else [])]
-    now += [f"    sample_{n} : ARRAY[0..{len(m.signals(n)) - 1}] OF LREAL;" for n in read]
+    columns = {n: len(m.signals(n)) for n in read} | {"mv_by_hand": n_mv}
+    now += [f"    sample_{n} : ARRAY[0..{width - 1}] OF LREAL;" for n, width in columns.items()]
     if len(sp):
         now.append(f"    set_points : {array_of('LREAL', sp.tolist())};")
     call = ", ".join(f"{n} := now_{n}" for n in step.inputs)
@@ -82,7 +83,7 @@ def printed_vectors_program(m: Manifest, name: str, step: StepBlock, kit: KitInC
         "    step_number := step_number + 1;",
         "END_IF;",
         f"IF scan_number < {len(kit.scans)} THEN",
-        *(line for n in read for line in _taken(f"sample_{n}", f"scan_{n}", len(m.signals(n)), "scan_number", True)),
+        *(line for n, w in columns.items() for line in _taken(f"sample_{n}", f"scan_{n}", w, "scan_number", True)),
         "    command := scan_mode_command[scan_number];",
         "    IF (scan_number = 0) AND (command < 0) THEN",
         "        command := 1; (* the kit begins in AUTO *)",
@@ -144,6 +145,8 @@ def _scan_call(m: Manifest, kit: KitInC, read: Sequence[str]) -> str:
         "has_mv_applied": "scan_has_mv_applied[scan_number]",
         "age_s": "scan_age_s[scan_number]",
         "mode_command": "command",
+        "send_mv": "scan_send_mv[scan_number]",
+        "mv_by_hand": "sample_mv_by_hand",
         "unwritten": "scan_unwritten[scan_number]",
         "missed_periods": "scan_missed[scan_number]",
         "recover_after": str(int(kit.loop["recover_after"])),
@@ -171,12 +174,14 @@ def _scans(m: Manifest, scans: Sequence[Mapping[str, Any]]) -> dict[str, str]:
         "has_mv_applied": array_of("BOOL", [bool(v) for v in read["mv_applied"]]),
         "age_s": array_of("LREAL", [_finite(s.get("age_s", "0x0p0")) for s in samples]),
         "mode_command": array_of("DINT", modes),
+        "send_mv": array_of("BOOL", [s["set_mv"] is not None for s in scans]),
         "unwritten": array_of("BOOL", [bool(s["unwritten"]) for s in scans]),
         "missed": array_of("LREAL", [float(s["missed"]) for s in scans]),
         "mode": array_of("DINT", [MODES.index(Mode(s["mode"])) for s in scans]),
         "fault": array_of("BOOL", [bool(s["fault"]) for s in scans]),
         "writes": array_of("BOOL", [s["mv"] is not None for s in scans]),
         "mv": numbers([s["mv"] for s in scans], len(m.mv)),
+        "mv_by_hand": numbers([s["set_mv"] for s in scans], len(m.mv)),
     }
 
 

@@ -576,7 +576,9 @@ typedef struct {
   double *pv;      /* numbers for the law */
   double *told;    /* fresh and operate as they were set, while a step has others */
   double *wanted; /* where an operator sent the MV, while by_hand: it goes there by at most its max_move a period */
-  bool by_hand;
+  bool by_hand;   /* the MV is on its way there */
+  bool hand;      /* the MV of the last scan is an operator's, in MANUAL since then */
+  bool is_read;   /* a sample has had a read-back, sound or not */
   char reason[WORDS]; /* of the last scan; empty: no fault */
 } Loop;
 
@@ -626,8 +628,19 @@ static void loop_close(Loop *l) {
   free(l->told);
 }
 
-/* Set points (SP); or the MV (MV) from an operator in MANUAL, to which it goes by at most its max_move a period, or that the plant has, while it is not known. False, and
-   nothing changed, outside the ranges, for the MV in another mode, and after a command that did not arrive. */
+/* Begin the way to where an operator wants the MV. One whose moves are not limited is there, unless all wait for a scan that
+   tells where they stand: from a read-back, or at once where there is none; a bad one ends the way. */
+static void loop_send(Loop *l, bool wait) {
+  l->by_hand = false;
+  for (size_t k = 0; k < l->c->n_in[MV]; k++) {
+    if (wait || l->c->signals[MV].at[k].max_move < INFINITY) l->by_hand = true;
+    else l->mv[k] = l->wanted[k];
+  }
+}
+
+/* Set points (SP); or the MV (MV) from an operator in MANUAL, to which it goes by at most its max_move a period, or that the
+   plant has, while it is not known. False, and nothing changed, outside the ranges, for the MV in another mode, and after a
+   command that did not arrive. */
 static bool loop_set(Loop *l, int which, const double *values) {
   const Signals *signals = &l->c->signals[which];
   if (which == MV && l->lost)
@@ -639,11 +652,10 @@ static bool loop_set(Loop *l, int which, const double *values) {
     if (!may_be(s, values[i], 0) || (s->values && !among(s, values[i])))
       return failed(l->c, "%s = %g %s is not allowed", s->name, values[i], s->unit);
   }
-  l->by_hand = l->by_hand && which == SP;
-  for (size_t i = 0; which == MV && l->mode == MANUAL && i < signals->n; i++)
-    l->by_hand = l->by_hand || signals->at[i].max_move < INFINITY;
-  l->taken = l->taken && (which == SP || l->by_hand); /* else the MV is where it was sent */
-  memcpy(which == SP ? l->sp : l->by_hand ? l->wanted : l->mv, values, signals->n * sizeof *values);
+  l->hand = which == MV ? l->mode == MANUAL : l->hand;
+  memcpy(which == SP ? l->sp : l->hand ? l->wanted : l->mv, values, signals->n * sizeof *values);
+  if (which == MV && l->hand) loop_send(l, !loop_placed(l));
+  else if (which == MV) l->by_hand = l->taken = false; /* it is where the operator says */
   return true;
 }
 
@@ -663,6 +675,7 @@ static void loop_by_hand(Loop *l) {
 
 static void loop_set_mode(Loop *l, Mode mode) {
   l->by_hand = l->by_hand && l->mode == mode;
+  l->hand = l->hand && l->mode == mode;
   l->taken = mode != SHADOW && (l->taken || l->mode == SHADOW);
   l->mode = mode;
   l->fault = false;
@@ -694,7 +707,11 @@ static void loop_fault(Loop *l, const char *reason) {
 /* The last MV never reached the plant, and others may move it meanwhile: nothing is written until a scan has found where
    it stands. */
 static void loop_unwritten(Loop *l, const char *reason) {
-  if (l->mode != MANUAL || l->by_hand) memcpy(l->mv, l->before, l->c->n_in[MV] * sizeof *l->mv);
+  size_t n = l->c->n_in[MV];
+  bool goes = l->hand && (l->by_hand || !isnan(l->mv[0]));
+  if (!l->by_hand) memcpy(l->wanted, l->mv, n * sizeof *l->mv);
+  memcpy(l->mv, l->before, n * sizeof *l->mv);
+  if (goes) loop_send(l, isnan(l->mv[0])); /* where it should be is where it goes, from where it stands */
   l->lost = true;
   loop_fault(l, reason);
 }
@@ -744,12 +761,13 @@ static bool trusted(Controller *c, const Sample *sample, bool *bad) {
 
 /* Where the MV stands after a command that did not arrive, and after others had it: at the next sound read-back, also that
    of a sample which is refused for another reason. A good sample without one says that nothing is read back: the MV before
-   it stays. After an implausible one the old MV is nothing to go back to. */
+   it stays, also at once where there has never been a read-back. After a bad one the old MV is nothing to go back to. */
 static void loop_found(Loop *l, const double *applied, bool good_one) {
   bool sound = applied && implausible(l->c, applied) == l->c->n_in[MV];
-  bool blind = sound && l->by_hand && isnan(l->mv[0]); /* until now on a way by hand from nobody knows where */
-  if (!(l->lost || l->taken || blind) || (!applied && !good_one)) return;
-  l->by_hand = l->by_hand && !(applied && (l->lost || (l->taken && !sound))); /* it stays where it is found */
+  bool blind = l->by_hand && isnan(l->mv[0]); /* on a way by hand from nobody knows where */
+  l->is_read = l->is_read || applied;
+  if (!(l->lost || l->taken || blind) || (!applied && !good_one && l->is_read)) return;
+  l->by_hand = l->by_hand && !(applied && (l->lost || !sound)); /* it stays where it is found */
   l->lost = l->lost && applied && !sound;
   l->taken = l->taken && applied && !sound;
   if (sound) clip(l->c, applied, l->mv);
@@ -818,8 +836,10 @@ static void loop_take(Loop *l, const Sample *sample) {
   bool apart = c->uses[FRESH], good_one = sample && trusted(c, sample, apart ? l->bad : NULL);
   if (!good_one) loop_missed(l, 1);
   else if (apart) good_one = loop_bridge(l, sample->pv);
-  if (sample) loop_found(l, sample->mv_applied, good_one);
+  loop_found(l, sample ? sample->mv_applied : NULL, good_one);
   memcpy(l->before, l->mv, n * sizeof *l->mv);
+  if (l->by_hand && isnan(l->mv[0]) && !l->lost && !l->taken && !(sample && sample->mv_applied))
+    memcpy(l->mv, l->wanted, n * sizeof *l->mv); /* nobody but the operator says where it is */
   if (!good_one) {
     loop_fault(l, sample ? c->words : "the plant cannot be read");
     return;
@@ -844,10 +864,9 @@ static void loop_take(Loop *l, const Sample *sample) {
 /* One period: l->mv is what to write if loop_writes, l->mode and l->reason say why. sample NULL: the plant cannot be
    read. */
 static void loop_scan(Loop *l, const Sample *sample) {
-  if (l->by_hand && isnan(l->mv[0]) && !(sample && sample->mv_applied)) /* nobody but the operator says where it is */
-    memcpy(l->mv, l->wanted, l->c->n_in[MV] * sizeof *l->mv);
   loop_take(l, sample);
   if (l->by_hand && loop_writes(l)) loop_by_hand(l);
+  l->hand = l->mode == MANUAL;
 }
 
 #ifndef LOOPWRIGHT_NO_MAIN
@@ -1018,6 +1037,8 @@ static bool kit_scan(Loop *l, const Json *row, const Json *scale, double *room[I
   const Json *given = json_get(row, "sample");
   for (int i = 0; i < MODES; i++)
     if (!strcmp(json_word(row, "set_mode"), MODE[i])) loop_set_mode(l, (Mode)i);
+  const double *by_hand = numbers(json_get(row, "set_mv"), c->n_in[MV], room[MV]);
+  if (by_hand) loop_set(l, MV, by_hand); /* it may have to be refused */
   const Json *unwritten = json_get(row, "unwritten"); /* the command of the scan before did not arrive */
   if (unwritten && unwritten->kind == J_TRUE) loop_unwritten(l, "the plant cannot be written");
   double missed = json_number(json_get(row, "missed"));
@@ -1110,8 +1131,8 @@ static int conformance(const char *folder, const char *answers) {
     return 2;
   }
   double version = json_number(json_get(&kit, "kit"));
-  if (version != 5) {
-    fprintf(stderr, "error: the kit has the version %g, not 5: write it again with loopwright conformance FILE.onnx KIT\n", version);
+  if (version != 6) {
+    fprintf(stderr, "error: the kit has the version %g, not 6: write it again with loopwright conformance FILE.onnx KIT\n", version);
     json_free(&kit);
     return 2;
   }

@@ -295,10 +295,12 @@ export class Loop {
     this.ahead = null; // set it before a scan: what is to come, as of Controller.step; null: nothing
     this.wishes = {}; // the values that somebody has set, by name; they outlast a law that lacks them
     this.wanted = null; // where an operator sent the MV: it goes there by at most its max_move a period
+    this.hand = false; // the MV of the last scan is an operator's, in MANUAL since then
+    this.isRead = false; // a sample has had a read-back, sound or not
   }
 
   setMode(mode) {
-    if (mode !== this.mode) this.wanted = null;
+    if (mode !== this.mode) Object.assign(this, { wanted: null, hand: false });
     this.taken = mode !== "SHADOW" && (this.taken || this.mode === "SHADOW");
     Object.assign(this, { mode, fault: "", good: 0 });
   }
@@ -316,9 +318,16 @@ export class Loop {
   setMv(mv) {
     if (this.mode !== "MANUAL") throw new Refused(`the MV is set by hand in MANUAL only; the loop is in ${this.mode}`);
     if (this.lost) throw new Refused("the last MV did not reach the plant, so where the MV stands is not known; wait");
-    const signals = this.controller.manifest.mv, wanted = within(mv, signals, "MV");
-    if (signals.some(limits)) this.wanted = wanted;
-    else Object.assign(this, { mv: wanted, taken: false });
+    this.#send(within(mv, this.controller.manifest.mv, "MV"), this.taken || !this.mv);
+    this.hand = true;
+  }
+
+  // Begin the way to where an operator wants the MV. One whose moves are not limited is there, unless all wait for a scan that
+  // tells where they stand: from a read-back, or at once where there is none; a bad one ends the way.
+  #send(wanted, wait) {
+    const signals = this.controller.manifest.mv;
+    this.wanted = wait || signals.some(limits) ? wanted : null;
+    if (!wait) this.mv = signals.map((s, i) => (limits(s) ? this.mv[i] : wanted[i]));
   }
 
   // Another controller takes over; it has no past. It has by name what somebody has set of `operate`, and its own defaults for
@@ -353,10 +362,10 @@ export class Loop {
     if (reason) this.bridging.missed();
     reason ||= readings?.reason ?? "";
     this.#found(given, reason);
-    if (!given?.mv_applied) this.mv ??= this.wanted; // nobody but the operator says where it is
     this.before = this.mv;
+    if (!given?.mv_applied && !this.lost && !this.taken) this.mv ??= this.wanted; // nobody but the operator says where it is
     if (!reason && !given.mv_applied && !this.mv) reason = UNKNOWN;
-    if (reason) return this.#miss(reason);
+    if (reason) return this.#held(reason);
     const applied = given.mv_applied ? this.#clipped(given.mv_applied) : this.mv;
     if (!this.mv || this.mode === "SHADOW") this.mv = applied;
     let step;
@@ -365,12 +374,13 @@ export class Loop {
       step = await this.controller.step({ sp: this.sp, pv, dv: given.dv, mv_applied: applied, state: this.state, operate, fresh, ahead: this.ahead });
     } catch (error) {
       if (this.mode === "AUTO") this.mv = applied;
-      return this.#miss(wordsOf(error));
+      return this.#held(wordsOf(error));
     }
     this.state = step.state_next;
     if (this.fault && ++this.good === this.recoverAfter) this.setMode("AUTO");
     if (this.mode === "AUTO") this.mv = Array.from(step.mv);
     this.#byHand();
+    this.hand = this.mode === "MANUAL";
     const { bridged = {}, shed = {} } = readings ?? {};
     return { mode: this.mode, mv: this.#written(), law: Array.from(step.mv), info: Array.from(step.info), reason: this.fault, bridged, shed };
   }
@@ -378,19 +388,22 @@ export class Loop {
   // The command in place of the last one, which never reached the plant. Others may move the MV meanwhile: nothing is
   // written until a scan has found where it stands.
   unwritten(reason) {
-    if (this.mode !== "MANUAL" || this.wanted) this.mv = this.before;
+    const goal = this.wanted ?? this.mv;
+    this.mv = this.before;
+    if (this.hand && goal) this.#send(goal, !this.mv); // where it should be is where it goes, from where it stands
     this.lost = true;
     return this.#miss(reason);
   }
 
   // Where the MV stands after a command that did not arrive, and after others had it: at the next sound read-back, also that
   // of a sample which is refused for another reason. A good sample without one says that nothing is read back: the MV before
-  // it stays. After an implausible one the old MV is nothing to go back to.
+  // it stays, also at once where there has never been a read-back. After a bad one the old MV is nothing to go back to.
   #found(given, reason) {
     const applied = given?.mv_applied, sound = applied && !this.#implausible(applied);
-    const blind = sound && this.wanted && !this.mv; // until now on a way by hand from nobody knows where
-    if (!(this.lost || this.taken || blind) || (!applied && reason)) return;
-    if (applied && (this.lost || (this.taken && !sound))) this.wanted = null; // it stays where it is found
+    const blind = this.wanted && !this.mv; // on a way by hand from nobody knows where
+    this.isRead ||= Boolean(applied);
+    if (!(this.lost || this.taken || blind) || (!applied && reason && this.isRead)) return;
+    if (applied && (this.lost || !sound)) this.wanted = null; // it stays where it is found
     if (applied) this.mv = sound ? this.#clipped(applied) : null;
     this.lost &&= Boolean(applied && !sound);
     this.taken &&= Boolean(applied && !sound);
@@ -407,6 +420,13 @@ export class Loop {
     if (this.mode === "AUTO" || this.fault) Object.assign(this, { mode: "HOLD", fault: reason });
     if (!this.lost && !this.taken) this.#byHand();
     return { mode: this.mode, mv: this.#written(), law: null, info: null, reason };
+  }
+
+  // The end of a scan without an MV of the law.
+  #held(reason) {
+    const command = this.#miss(reason);
+    this.hand = this.mode === "MANUAL";
+    return command;
   }
 
   // One period nearer to where an operator sent the MV.

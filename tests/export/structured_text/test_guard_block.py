@@ -45,6 +45,8 @@ def given_of(scan: Mapping[str, Any], m: Manifest) -> dict[str, Any]:
     sample = scan["sample"]
     given: dict[str, Any] = {
         "mode_command": MODES.index(Mode(scan["set_mode"])) if scan["set_mode"] else -1,
+        "send_mv": scan["set_mv"] is not None,
+        "mv_by_hand": [float.fromhex(v) for v in scan["set_mv"] or ["0x0p0"] * len(m.mv)],
         "unwritten": bool(scan["unwritten"]),
         "missed_periods": float(scan["missed"]),
         "sample_read": sample is not None,
