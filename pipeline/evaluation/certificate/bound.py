@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-from scipy.stats import beta
-
 
 def at_most_fail(failures: int, loops: int, confidence: float) -> float:
     """The largest share of failures that ``failures`` of ``loops`` independent loops allow, one-sided.
@@ -14,6 +12,8 @@ def at_most_fail(failures: int, loops: int, confidence: float) -> float:
 
     Whatever the true share is, it lies above this bound in at most 1 - ``confidence`` of all certificates.
     """
+    from scipy.stats import beta  # half a second to load
+
     if failures >= loops:
         return 1.0
     return float(beta.ppf(confidence, failures + 1, loops - failures))
