@@ -110,7 +110,8 @@ class Certificate:
     @property
     def sentence(self) -> str:
         """The certificate in one sentence: ``of plants like these at most 1 % fail, ...``."""
-        few = f", a small number: {_loops_of_a_percent(self.confidence)} can show 1 %" if self.small else ""
+        enough = loops_without_failure(SMALL_SHARE, self.confidence)
+        few = f", a small number: {enough} can show 1 %" if self.small else ""
         return (
             f"of plants like these at most {_percent_up(self.at_most)} fail, with {100 * self.confidence:.6g} % "
             f"confidence ({self.failures} of {self.loops} closed loops failed{few})"
@@ -179,6 +180,11 @@ def certificate_of(manifest: Manifest, law: str) -> CertificateRead:
     return CertificateRead(found)
 
 
+def loops_without_failure(share: float, confidence: float) -> int:
+    """The fewest loops of which none may fail so that at most ``share`` of all do: (1 - share)^n <= 1 - confidence."""
+    return math.ceil(round(math.log(1 - confidence) / math.log(1 - share), 9))
+
+
 def failures_probability(failures: int, loops: int, share: float) -> float:
     """Probability of at most so many failures among ``loops``, where a ``share`` of the family, below 1, fails.
 
@@ -216,11 +222,6 @@ def _percent_up(share: float) -> str:
     percent = 100 * share
     step = 10.0 ** (math.floor(math.log10(percent)) - 1)
     return f"{min(math.ceil(round(percent / step, 9)) * step, 100):.2g} %" if percent < 99.5 else "100 %"
-
-
-def _loops_of_a_percent(confidence: float) -> int:
-    """Loops of which none may fail so that at most SMALL_SHARE of the family do."""
-    return math.ceil(round(math.log(1 - confidence) / math.log(1 - SMALL_SHARE), 9))
 
 
 def _span(ends: tuple[float, float]) -> str:

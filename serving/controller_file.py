@@ -12,6 +12,7 @@ from typing import Any
 
 from loopwright.serving.errors import ArtifactError, SignatureError
 from loopwright.serving.graph import audit
+from loopwright.serving.graph.onnx_bytes import write_model
 from loopwright.serving.manifest import MANIFEST_KEY, MAX_CHARACTERS, Manifest, strictly
 
 # -------------------------------------------------------------- a last metadata entry that covers every byte before it
@@ -55,7 +56,7 @@ def law_digest(data: bytes, manifest: str) -> str:
     It stays the same where evidence is added. Only the last entry before the digest is taken for the manifest, where
     the exporter writes it; wherever else it stands, its evidence counts too.
     """
-    body, entry = data[:-TRAILER_BYTES], _metadata_entry(MANIFEST_KEY, manifest)
+    body, entry = data[:-TRAILER_BYTES], write_model({"metadata_props": [{"key": MANIFEST_KEY, "value": manifest}]})
     graph = body.removesuffix(entry)
     contract = json.loads(manifest)
     contract.pop("evidence", None)
@@ -67,21 +68,6 @@ def law_in(data: bytes) -> str:
     """The law's digest of a controller's file; ArtifactError where it is none, or was changed after its export."""
     unseal(data)
     return law_digest(data, audit.audit(data).metadata.get(MANIFEST_KEY, ""))
-
-
-def _metadata_entry(key: str, value: str) -> bytes:
-    """An entry of ModelProto.metadata_props as protobuf writes it."""
-    texts = ((b"\x0a", key.encode()), (b"\x12", value.encode()))
-    inner = b"".join(tag + _varint(len(text)) + text for tag, text in texts)
-    return b"\x72" + _varint(len(inner)) + inner
-
-
-def _varint(value: int) -> bytes:
-    found = bytearray()
-    while value > 0x7F:
-        found.append(value & 0x7F | 0x80)
-        value >>= 7
-    return bytes([*found, value])
 
 
 # ---------------------------------------------------------------- the manifest for hosts that cannot read the metadata

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from loopwright.pipeline.commands.arguments import case_of, real, require_shipped, whole
+from loopwright.pipeline.commands.stress import loop_options
 from loopwright.pipeline.config.params import (
     MOST_CONFIDENCE,
     PARAMS_FILE,
@@ -22,15 +23,14 @@ from loopwright.pipeline.config.params import (
 )
 from loopwright.pipeline.errors import ParamsError
 from loopwright.pipeline.evaluation.case import Case
-from loopwright.pipeline.evaluation.certificate.bound import loops_without_failure
 from loopwright.pipeline.evaluation.certificate.plan import CertificatePlan, plan_again
-from loopwright.pipeline.evaluation.stress.batches import STRESS_BATCH, outcomes_of
+from loopwright.pipeline.evaluation.stress.batches import outcomes_of
 from loopwright.pipeline.evaluation.stress.loops import Stress, opened
 from loopwright.pipeline.export.controller_file import with_evidence
-from loopwright.pipeline.export.plain_code.compiled_law import LAW_BY, law_stepping
+from loopwright.pipeline.export.plain_code.compiled_law import law_stepping
 from loopwright.pipeline.files import read_json, write_json
 from loopwright.pipeline.report.stress import replay_loop
-from loopwright.serving.certificate import CERTIFICATE, Certificate, certificate_of
+from loopwright.serving.certificate import CERTIFICATE, Certificate, certificate_of, loops_without_failure
 from loopwright.serving.controller import Controller
 
 CERTIFIED_LOOPS = loops_without_failure(0.01, 0.99)
@@ -53,11 +53,8 @@ def options(parser: argparse.ArgumentParser) -> None:
         help="a loop fails too whose figure is larger, as mae=0.5; may be given again")  # fmt: skip
     add("--swings", action="store_true", default=None, help="a loop fails too that swings to the end")
     add("--plan-only", action="store_true", help="write the plan, and run nothing yet")
-    add("--workers", metavar="N", type=whole(1), help="processes side by side (one a core)")
-    add("--batch", metavar="N", type=whole(1), default=STRESS_BATCH, help=f"loops of a piece of work ({STRESS_BATCH})")
     add("--out", metavar="FOLDER", type=Path, help="of plan, certificate and certified file (CASE-LAW-certificate)")
-    add("--law-by", choices=LAW_BY, default=LAW_BY[0],
-        help=f"steps of the law: c, its plain C; onnx, onnxruntime; auto, c where it can be ({LAW_BY[0]})")  # fmt: skip
+    loop_options(parser)
     add("--replay", metavar="K", type=whole(0), help="run one loop of the file's certificate again, and draw it")
 
 

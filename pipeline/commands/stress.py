@@ -39,12 +39,18 @@ def options(parser: argparse.ArgumentParser) -> None:
         help=f"share of the loops with a fault of an actuator ({STRESS_FAULTS:g})")  # fmt: skip
     add("--operate", metavar=OPERATE, type=_operated, action="append", default=[],
         help="of what operators may change, another value than the file's default")  # fmt: skip
+    add("--out", metavar="FOLDER", type=Path, help="where the report goes (CASE-LAW-stress)")
+    loop_options(parser)
+    add("--replay", metavar="INDEX", type=whole(0), help="run one loop again, and draw it")
+
+
+def loop_options(parser: argparse.ArgumentParser) -> None:
+    """Add what many closed loops run on: workers, batches, and what steps the law."""
+    add = parser.add_argument
     add("--workers", metavar="N", type=whole(1), help="processes side by side (one a core)")
     add("--batch", metavar="N", type=whole(1), default=STRESS_BATCH, help=f"loops of a piece of work ({STRESS_BATCH})")
-    add("--out", metavar="FOLDER", type=Path, help="where the report goes (CASE-LAW-stress)")
     add("--law-by", choices=LAW_BY, default=LAW_BY[0],
         help=f"steps of the law: c, its plain C; onnx, onnxruntime; auto, c where it can be ({LAW_BY[0]})")  # fmt: skip
-    add("--replay", metavar="INDEX", type=whole(0), help="run one loop again, and draw it")
 
 
 def _operated(text: str) -> TimedValue:

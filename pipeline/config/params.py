@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 import os
 import re
 from collections.abc import Iterable, Mapping
@@ -18,6 +17,7 @@ from loopwright.pipeline.config.reading import tree_of
 from loopwright.pipeline.errors import ParamsError, nearest
 from loopwright.pipeline.files import write_bytes
 from loopwright.serving import fields
+from loopwright.serving.certificate import loops_without_failure
 
 T = TypeVar("T")
 PARAMS_FILE = Path("params.yaml")
@@ -120,7 +120,7 @@ class CertificateParams:
         for name in ("spread", "faults"):
             if not 0 <= getattr(self, name) <= 100:
                 raise ValueError(f"{name} is {getattr(self, name):g} %; it must be from 0 to 100 %")
-        least = math.ceil(math.log(1 - self.confidence / 100) / math.log(1 - MOST_FAILING))
+        least = loops_without_failure(MOST_FAILING, self.confidence / 100)
         if self.loops and self.loops < least:
             raise ValueError(
                 f"loops is {self.loops}, too few to say anything: even where none fails, more than "

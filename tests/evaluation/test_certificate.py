@@ -12,11 +12,11 @@ from scipy.stats import binom
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.config.params import CertificateParams
 from loopwright.pipeline.errors import ParamsError, PlantError
-from loopwright.pipeline.evaluation.certificate.bound import at_most_fail, loops_without_failure
+from loopwright.pipeline.evaluation.certificate.bound import at_most_fail
 from loopwright.pipeline.evaluation.certificate.plan import CertificatePlan, plan_again
 from loopwright.pipeline.evaluation.stress.draws import LATE_LOOPS, NOISE, Drawing
 from loopwright.pipeline.evaluation.stress.loops import StressOutcome
-from loopwright.serving.certificate import Certificate, failures_probability
+from loopwright.serving.certificate import Certificate, failures_probability, loops_without_failure
 
 PH_CASE = CASES["ph_neutralization"]
 SURE = 0.99

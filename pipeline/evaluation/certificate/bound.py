@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 
 def at_most_fail(failures: int, loops: int, confidence: float) -> float:
     """The largest share of failures that ``failures`` of ``loops`` independent loops allow, one-sided.
@@ -17,8 +15,3 @@ def at_most_fail(failures: int, loops: int, confidence: float) -> float:
     if failures >= loops:
         return 1.0
     return float(beta.ppf(confidence, failures + 1, loops - failures))
-
-
-def loops_without_failure(share: float, confidence: float) -> int:
-    """The fewest loops of which none may fail so that at most ``share`` of all do: (1 - share)^n <= 1 - confidence."""
-    return math.ceil(math.log(1 - confidence) / math.log(1 - share))

@@ -85,8 +85,8 @@ def entries_of(
         add("cv", s, "high", s.high if high is None else high, s.low, s.high, s.unit)
         add("cv", s, "rank", float(USUAL_RANK), 1.0, float(MOST_RANKS))
         add("cv", s, "cost", 0.0, -MOST_COST, MOST_COST, f"1/{s.unit}")
-    rates = rates_of(signals, mv_rate) or (math.inf for _ in signals.mv)
-    for s, rate in zip(signals.mv, rates, strict=False):
+    rates = rates_of(signals, mv_rate) or (math.inf,) * len(signals.mv)
+    for s, rate in zip(signals.mv, rates, strict=True):
         fastest = min(rate, s.high - s.low)
         add("mv", s, "use", 1.0, 0.0, 1.0)
         add("mv", s, "low", s.low, s.low, s.high, s.unit)
