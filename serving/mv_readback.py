@@ -120,6 +120,11 @@ class AppliedMV:
         return self._standing.lost
 
     @property
+    def is_read(self) -> bool:
+        """Whether the plant has ever been read back, soundly or not: a later sample may tell where the MV stands."""
+        return self._is_read
+
+    @property
     def taken(self) -> bool:
         """Whether others had the MV until now, and no sample has told since where it stands."""
         return self._taken

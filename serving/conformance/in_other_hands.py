@@ -81,6 +81,12 @@ def never_read_back(m: Manifest, good: Sample, recovery: int) -> Scans:
         good = yield KitScan(f"after {lost}", none(good))
     good = yield KitScan(NOT_FINITE, _not_finite(good), unwritten=True)
     good = yield KitScan("no read-back after a bad one: not known where the MV stands", none(good))
+    unknown = "by hand from nowhere known, on a plant that reads back"
+    good = yield KitScan(f"{unknown}: no sample", None, Mode.MANUAL, set_mv=at(m, 0.9))
+    good = yield KitScan(f"{unknown}: a sample is too old", old(none(good)))
+    good = yield KitScan(f"{unknown}: a good sample without a read-back", none(good))
+    good = yield KitScan(NOT_FINITE, _not_finite(good), unwritten=True)
+    good = yield KitScan("no read-back after a bad one: not known where the MV stands", none(good))
     if apart(m):
         return good
     for bad, words in ((partial(outside, m), "outside"), (_not_finite, "not finite")):

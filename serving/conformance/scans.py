@@ -20,8 +20,8 @@ from loopwright.serving.conformance.in_other_hands import (
     too_old,
 )
 from loopwright.serving.conformance.kit_samples import KitScan, apart, changed, doubtful, moved
-from loopwright.serving.controller import Controller
-from loopwright.serving.errors import LoopError
+from loopwright.serving.controller import Controller, Step
+from loopwright.serving.errors import LoopError, OutputError
 from loopwright.serving.guard import Sample
 from loopwright.serving.loop import Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest, Signal
@@ -89,7 +89,7 @@ def scanned(controller: Controller) -> list[Scanned]:
         learns=False,  # what every host does: one step a scan
     )
     course, stands, done = _Course(controller.manifest), actuators(controller.manifest), []
-    scans = _scans(controller.manifest, course.sample(stands))
+    scans = _scans(controller.manifest, course.sample(stands), _before_and_after(controller, begin.sp))
     scan, before = next(scans), loop.mv
     while True:
         if scan.set_mode is not None:
@@ -111,8 +111,8 @@ def scanned(controller: Controller) -> list[Scanned]:
             return done
 
 
-def _scans(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
-    """Each scan; ``send`` takes a good sample for the next one."""
+def _scans(m: Manifest, good: Sample, told: tuple[Sample, Sample]) -> Generator[KitScan, Sample, None]:
+    """Each scan; ``send`` takes a good sample for the next one. ``told``: a rest and a move that tell a cold start."""
 
     def some(n: int, what: str = "good") -> Generator[KitScan, Sample, None]:
         nonlocal good
@@ -167,6 +167,55 @@ def _scans(m: Manifest, good: Sample) -> Generator[KitScan, Sample, None]:
         good = yield from _gone(m, good)
     good = yield from others_command(m, good, KIT_RECOVERY)
     yield from by_hand(m, good, KIT_RECOVERY)
+    yield from _cold_start(*told)
+
+
+# ---------------------------------------------------------------------------------------------- a cold start that shows
+RESTS = 6  # good samples over which the PVs rest before a cold start
+TRIALS = 256
+
+
+def _before_and_after(controller: Controller, sp: Array) -> tuple[Sample, Sample]:
+    """A sample that rests, and one after it whose MV tells most whether the law began cold there.
+
+    Samples at random leave a law at an end of its MV's range, where a start that is not cold gives the same MV. Of
+    ``TRIALS`` rests and jumps of the PVs the one is taken after which the MVs, as shares of their ranges, differ most
+    between a step from the rest's state and a step from the cold state. Without a state there is nothing to tell.
+    """
+    m, rng = controller.manifest, np.random.default_rng(2)
+    span = np.array([s.high - s.low for s in m.mv])
+    middle = np.array([s.middle for s in m.pv], dtype=np.float64)
+    width = np.array([0.0 if s.values else s.high - s.low for s in m.pv])
+    rest = Sample(pv=middle, mv_applied=actuators(m), dv=np.array([s.middle for s in m.dv], dtype=np.float64))
+    told, most = (rest, rest), 0.0
+    for k in range(TRIALS if m.n_state else 0):
+        wide = (0.05, 0.2, 0.5, 1.0)[k % 4] * width
+        pv = middle + wide * rng.uniform(-0.5, 0.5, len(width))
+        jumped = np.clip(pv + 0.2 * wide * rng.uniform(-1, 1, len(width)), middle - 0.5 * width, middle + 0.5 * width)
+        trial = replace(rest, pv=pv), replace(rest, pv=jumped)
+        with suppress(OutputError):
+            state, mv = controller.cold_state(), actuators(m)
+            for _ in range(RESTS):
+                mv, state, _ = _stepped(controller, sp, trial[0], mv, state)
+            begun = _stepped(controller, sp, trial[1], mv, controller.cold_state())
+            differ = float(np.max(np.abs(_stepped(controller, sp, trial[1], mv, state).mv - begun.mv) / span))
+            if differ > most:
+                told, most = trial, differ
+    return told
+
+
+def _stepped(controller: Controller, sp: Array, sample: Sample, mv: Array, state: Array) -> Step:
+    return controller.step(sp=sp, pv=sample.pv, mv_applied=mv, state=state, dv=sample.dv)
+
+
+def _cold_start(rest: Sample, after: Sample) -> Generator[KitScan, Sample, None]:
+    """A law that begins cold, rests, and begins cold again after missed periods."""
+    good = yield KitScan("at rest after missed periods", rest, set_mode=Mode.AUTO, missed=MAX_GAP + 1)
+    for _ in range(RESTS - 1):
+        good = yield KitScan("at rest", replace(rest, mv_applied=good.mv_applied))
+    for missed in (MAX_GAP + 1, 0, 0):
+        what = "moved after missed periods" if missed else "it stays moved"
+        good = yield KitScan(what, replace(after, mv_applied=good.mv_applied), missed=missed)
 
 
 STAYS_BAD = 3  # scans for which readings stay bad after they were bridged

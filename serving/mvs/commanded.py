@@ -89,8 +89,9 @@ class CommandedMV:
             raise LoopError("the last MV did not reach the plant, so where the MV stands is not known; wait")
 
     def move_by_hand(self, signals: tuple[Signal, ...]) -> None:
-        """One period nearer to where an operator sent them."""
-        self.now = self.out.hand.toward(self.now, signals)
+        """One period nearer to where an operator sent them; they wait for where they stand if a sample may tell it."""
+        if self.known or not self._plant.is_read:
+            self.now = self.out.hand.toward(self.now, signals)
 
     # ------------------------------------------------------------------ the plant
     def look(self, sample: Sample, reason: str, mode: Mode, in_hand: Those) -> ShownMV:

@@ -18,7 +18,8 @@ class ByHand:
     """Where an operator sent the MVs, and the way there: each by at most its ``max_move`` a period, as with any law.
 
     It counts from the last command, which also a plant without a read-back has. Where nobody knows where the MV
-    stands, it is where the operator says, once a scan shows no read-back; a bad one ends the way.
+    stands, it is where the operator says, once a good sample has no read-back, and at once where none has ever had one;
+    a bad read-back ends the way.
     """
 
     def __init__(self) -> None:

@@ -220,6 +220,29 @@ def test_by_hand_from_nowhere_known_a_bad_read_back_ends_the_way(
     assert loop.scan(sample(mv=None)).mv.tolist() == [20.0]  # nobody but the operator says where it is
 
 
+@pytest.mark.parametrize("refused", [None, sample(math.nan, mv=None)])
+def test_by_hand_from_nowhere_known_a_plant_that_reads_back_is_waited_for(
+    refused: Sample | None, pi_file: Path
+) -> None:
+    loop = loop_on(pi_file, mode=Mode.MANUAL)
+    loop.scan(sample(mv=200.0))  # it has a read-back, which tells nothing now
+    loop.set_mv([20.0])
+    command = loop.miss("no route") if refused is None else loop.scan(refused)
+    assert not command.writes
+    assert loop.mv_wanted.tolist() == [20.0]
+    assert loop.scan(sample()).mv.tolist() == [20.0]
+
+
+@pytest.mark.parametrize("refused", [None, sample(math.nan, mv=None)])
+def test_by_hand_from_nowhere_known_a_plant_that_never_read_back_is_moved(
+    refused: Sample | None, pi_file: Path
+) -> None:
+    loop = loop_on(pi_file, mode=Mode.MANUAL)
+    loop.set_mv([20.0])
+    command = loop.miss("no route") if refused is None else loop.scan(refused)
+    assert command.mv.tolist() == [20.0]
+
+
 @pytest.mark.parametrize("mode", [Mode.MANUAL, Mode.HOLD, Mode.AUTO])
 def test_after_a_bad_read_back_a_lost_command_leaves_no_mv_to_go_back_to(mode: Mode, pi_file: Path) -> None:
     loop = loop_on(pi_file, mode=mode)

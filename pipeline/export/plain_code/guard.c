@@ -194,7 +194,8 @@ static int to_come_allowed(const lower_loop *l, const double *dv)
 
 /* Where the MV stands after a command that did not arrive, and after others had it: at the next sound read-back, also of a
    sample that is refused for another reason. A good sample without one says that nothing is read back: the MV before it
-   stays, also at once where there has never been a read-back. After a bad one it is nothing to go back to. */
+   stays, also at once where there has never been a read-back. After a bad one it is nothing to go back to. The same scans
+   begin a way by hand from nobody knows where. */
 static void find(lower_loop *l, const lower_sample *s, int good_one)
 {
     const int back = s != NULL && s->has_mv_applied;
@@ -320,7 +321,7 @@ static void take(lower_loop *l, const lower_sample *s)
 #endif
     find(l, s, good_one);
     l->was_known = l->known;
-    said = l->by_hand && !l->known && !l->lost && !l->taken && !(s != NULL && s->has_mv_applied);
+    said = l->by_hand && !l->known && !l->lost && !l->taken && !(s != NULL && s->has_mv_applied) && (good_one || !l->is_read);
     for (k = 0; k < UPPER_N_MV; ++k) {
         l->before[k] = l->mv[k];
         l->mv[k] = said ? l->wanted[k] : l->mv[k]; /* nobody but the operator says where it is */

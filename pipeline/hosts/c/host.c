@@ -838,7 +838,7 @@ static void loop_take(Loop *l, const Sample *sample) {
   else if (apart) good_one = loop_bridge(l, sample->pv);
   loop_found(l, sample ? sample->mv_applied : NULL, good_one);
   memcpy(l->before, l->mv, n * sizeof *l->mv);
-  if (l->by_hand && isnan(l->mv[0]) && !l->lost && !l->taken && !(sample && sample->mv_applied))
+  if (l->by_hand && isnan(l->mv[0]) && !l->lost && !l->taken && !(sample && sample->mv_applied) && (good_one || !l->is_read))
     memcpy(l->mv, l->wanted, n * sizeof *l->mv); /* nobody but the operator says where it is */
   if (!good_one) {
     loop_fault(l, sample ? c->words : "the plant cannot be read");

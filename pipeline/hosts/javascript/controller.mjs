@@ -363,7 +363,7 @@ export class Loop {
     reason ||= readings?.reason ?? "";
     this.#found(given, reason);
     this.before = this.mv;
-    if (!given?.mv_applied && !this.lost && !this.taken) this.mv ??= this.wanted; // nobody but the operator says where it is
+    if (!given?.mv_applied && !this.lost && !this.taken && (!reason || !this.isRead)) this.mv ??= this.wanted; // nobody but the operator says where it is
     if (!reason && !given.mv_applied && !this.mv) reason = UNKNOWN;
     if (reason) return this.#held(reason);
     const applied = given.mv_applied ? this.#clipped(given.mv_applied) : this.mv;

@@ -149,20 +149,15 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("case", "faults"),
-    # The scans of the observer's kit do not show that a block forgot to begin cold.
-    [("reversible_cstr", tuple(FAULTS)), ("thiosulfate_cstr", tuple(FAULTS)[:2])],
-)
-def test_a_faulty_guard_is_found(case: str, faults: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("case", ["reversible_cstr", "thiosulfate_cstr"])
+def test_a_faulty_guard_is_found(case: str) -> None:
     file = next(f for f in FILES if f.parent.name == case)
     controller, program = Controller(file), lowered(onnx.load(file))
     block = printed_step_block(program, "tank")
     kit = kit_in_c(controller, program)
     functions = [printed_function("tank", f) for f in block.own_functions]
     guard = "\n".join(printed_guard(controller.manifest, "tank", block))
-    for right in faults:
-        wrong = FAULTS[right]
+    for right, wrong in FAULTS.items():
         assert guard.count(right) == 1, right
         text = "\n".join([*functions, block.text, guard.replace(right, wrong)])
         assert wrong_scans(Machine(text), controller.manifest, kit), wrong
