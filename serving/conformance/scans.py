@@ -30,6 +30,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 KIT_RECOVERY = 3  # good samples in a row after which a loop goes on
 MAX_GAP = 3  # missed periods in a row that a law bridges: after more it starts cold
+PATIENCE = 200  # samples of a shadow, in all, that a law may refuse
 ACTUATOR_STANDS = 0.3  # share of its range at which an actuator stands before the loop's first command: not its middle
 
 
@@ -88,23 +89,32 @@ def scanned(controller: Controller) -> list[Scanned]:
         max_gap=begin.max_gap,
         learns=False,  # what every host does: one step a scan
     )
-    course, stands, done = _Course(controller.manifest), actuators(controller.manifest), []
+    course, stands, done = _Course(controller.manifest), actuators(controller.manifest), list[Scanned]()
     scans = _scans(controller.manifest, course.sample(stands), _before_and_after(controller, begin.sp))
-    scan, before = next(scans), loop.mv
+    scan, before, waited = next(scans), loop.mv, 0
     while True:
+        now = scan
         if scan.set_mode is not None:
-            loop.set_mode(scan.set_mode)
-        if scan.set_mv is not None:
+            try:
+                loop.set_mode(scan.set_mode)
+            except LoopError:  # the law has refused the last sample of the shadow that is to end
+                waited += 1
+                if waited > PATIENCE:
+                    raise
+                now = KitScan("others have the plant until the law takes a sample", course.sample(stands))
+        if now.set_mv is not None:
             with suppress(LoopError):  # it may have to be refused
-                loop.set_mv(scan.set_mv)
-        if scan.unwritten:
+                loop.set_mv(now.set_mv)
+        if now.unwritten:
             loop.unwritten(before, "the plant cannot be written")
-        if scan.missed:
-            loop.gap(scan.missed)
+        if now.missed:
+            loop.gap(now.missed)
         before = loop.mv
-        command = loop.miss("the plant cannot be read") if scan.sample is None else loop.scan(scan.sample)
-        done.append(Scanned(scan, command))
+        command = loop.miss("the plant cannot be read") if now.sample is None else loop.scan(now.sample)
+        done.append(Scanned(now, command))
         stands = command.mv if command.writes or command.mode is Mode.SHADOW else stands  # a shadow's MV is others'
+        if now is not scan:
+            continue
         try:
             scan = scans.send(course.sample(stands))
         except StopIteration:
