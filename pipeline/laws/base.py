@@ -119,7 +119,7 @@ class ControlLaw(nn.Module, ABC):
     ahead: AheadInput | None = None  # of a law with one more input: set points and measured disturbances to come
     low: Tensor  # (n_mv,)
     high: Tensor  # (n_mv,)
-    rate: Tensor | None  # (n_mv,) largest change a sample, infinite without a limit; None where no MV has one
+    rate: Tensor | None  # (n_mv,) largest change a sample, twice the range without a limit; None where no MV has one
 
     def __init__(self, signals: Signals, mv_rate: Rates = None) -> None:
         super().__init__()
@@ -127,7 +127,10 @@ class ControlLaw(nn.Module, ABC):
         self.register_buffer("low", torch.tensor([s.low for s in signals.mv], dtype=torch.float64))
         self.register_buffer("high", torch.tensor([s.high for s in signals.mv], dtype=torch.float64))
         rates = rates_of(signals, mv_rate)
-        self.register_buffer("rate", None if rates is None else torch.tensor(rates, dtype=torch.float64))
+        # No MV moves farther than its range; an infinite rate could not be printed as C and Structured Text.
+        widest = [2 * (s.high - s.low) for s in signals.mv]
+        finite = None if rates is None else torch.tensor([*map(min, rates, widest)], dtype=torch.float64)
+        self.register_buffer("rate", finite)
 
     @classmethod
     @abstractmethod

@@ -125,6 +125,7 @@ def test_mv_stays_within_its_rate(make_law, name: str) -> None:
     signal = plant_of(name).mv_signals[continuous[0]]
     rate = RATE * (signal.high - signal.low)
     law = make_law(name, mv_rate=rate)
+    assert torch.isfinite(law.rate).all()  # also of an MV without a rate
     rng = np.random.default_rng(2)
     state = None
     for _ in range(30):

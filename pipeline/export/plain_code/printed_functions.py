@@ -5,9 +5,11 @@ from __future__ import annotations
 import ast
 import inspect
 from collections.abc import Iterator, Sequence
+from math import isfinite
 from types import ModuleType
 from typing import Any
 
+from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export.plain_code import elementary
 
 _SIGNS: dict[type[Any], str] = {
@@ -37,7 +39,9 @@ def constant_in_c(name: str, value: float | Sequence[float]) -> str:
 
 
 def number(value: float) -> str:
-    """The shortest decimal text that reads back as the same double."""
+    """The shortest decimal text that reads back as the same double; ExportError for one that is not finite."""
+    if not isfinite(value):
+        raise ExportError(f"the law has the constant {value}, which no text stands for; design it with finite numbers")
     return repr(float(value))
 
 

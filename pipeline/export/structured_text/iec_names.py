@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from loopwright.pipeline.errors import ExportError
 from loopwright.pipeline.export.plain_code.layout import WIDTH
+from loopwright.pipeline.export.plain_code.printed_functions import number
 from loopwright.serving.manifest import Manifest
 
 MOST_LETTERS = 60  # of a controller's name: with what is put behind it a name stays below the 125 letters of SCL
@@ -67,7 +68,7 @@ def _legal(name: str) -> bool:
 
 def lreal(value: float) -> str:
     """The shortest literal of IEC 61131-3 that reads back as the same double: a point is before each exponent."""
-    mantissa, _, exponent = repr(float(value)).partition("e")
+    mantissa, _, exponent = number(value).partition("e")
     point = "" if "." in mantissa else ".0"
     return f"{mantissa}{point}" + (f"E{int(exponent):+03d}" if exponent else "")
 

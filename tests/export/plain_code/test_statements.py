@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from loopwright.pipeline.export.plain_code.fusing import fused
 from loopwright.pipeline.export.plain_code.interpreter import run
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.memory import laid_out, overlaps, without_copies
+from loopwright.pipeline.export.plain_code.printed_functions import number
 from loopwright.pipeline.export.plain_code.self_test import kit_in_c
 from loopwright.pipeline.export.plain_code.statements import Place, PlainStatement
 from loopwright.serving import Controller
@@ -43,6 +46,15 @@ def test_statements_of_a_law_that_operators_steer(tmp_path: Path, sizes: tuple[i
     program = lowered(onnx.load(tmp_path / "law.onnx"))
     assert {"operate", "fresh", "ahead"} <= set(program.inputs)
     assert kit_in_c(Controller(tmp_path / "law.onnx"), program).worst < 1e-9
+
+
+def test_a_law_with_one_rated_mv_of_two_has_a_text(tmp_path: Path) -> None:
+    law = law_of(random_model(5, n_y=2, n_mv=2), horizon=15, mv_rate=(0.3, None))
+    export(law, tmp_path / "law.onnx", case="made", provenance={})
+    assert not re.search(r"\b(inf|nan)\b", printed_step(lowered(onnx.load(tmp_path / "law.onnx")), "x").definitions)
+    for value in (math.inf, math.nan):
+        with pytest.raises(ExportError):
+            number(value)
 
 
 @pytest.mark.parametrize("file", SHIPPED, ids=name)
