@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.conformance.in_other_hands import (
+    at,
     by_hand,
     never_read_back,
     no_read_back,
@@ -134,7 +135,8 @@ def _scans(m: Manifest, good: Sample, told: tuple[Sample, Sample]) -> Generator[
     good = yield KitScan("a PV at first not finite", changed(no_read_back(good), "pv", 0, nan))
     good = yield KitScan("no read-back at first", no_read_back(good))
     good = yield from never_read_back(m, good, KIT_RECOVERY)
-    good = yield KitScan("AUTO from nowhere known", None, set_mode=Mode.AUTO)
+    good = yield KitScan("an MV by hand in AUTO, from nowhere known", None, set_mode=Mode.AUTO, set_mv=at(m, 0.4))
+    good = yield KitScan("no read-back, and nobody has said where the MV stands", no_read_back(good))
     good = yield KitScan("a sample is too old, and not known where the MV stands", too_old(m, good))
     if m.mv[0].name not in apart(m):
         good = yield KitScan("an applied MV at first not finite", changed(good, "mv_applied", 0, nan))

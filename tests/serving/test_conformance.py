@@ -247,7 +247,7 @@ def test_the_scans_hold_what_an_operator_sends(vectors: Json) -> None:
     assert {rows[k]["mode"] for k in sends} == {"MANUAL", "HOLD", "AUTO"}
     assert len(taken) > 5
     silent = sum(rows[k]["mv"] is None for k in sends)
-    assert silent == 3 + 2 + 1  # from nowhere known, after others, and while it is lost
+    assert silent == 4 + 2 + 1  # from nowhere known, after others, and while it is lost
     assert sum(rows[k]["unwritten"] for k in sends) == 1
     changed = [row for row in rows if row["unwritten"] and row["set_mode"]]
     assert [row["set_mode"] for row in changed] == ["MANUAL", "MANUAL", "AUTO"]

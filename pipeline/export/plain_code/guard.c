@@ -439,7 +439,7 @@ int lower_set_sp(lower_loop *l, const double *sp)
 int lower_set_mv(lower_loop *l, const double *mv)
 {
     int k;
-    if (l->lost || (l->mode != UPPER_MANUAL && l->known)) {
+    if (l->lost || l->mode != UPPER_MANUAL) {
         return 0;
     }
     for (k = 0; k < UPPER_N_MV; ++k) {
@@ -450,17 +450,8 @@ int lower_set_mv(lower_loop *l, const double *mv)
     for (k = 0; k < UPPER_N_MV; ++k) {
         l->wanted[k] = mv[k];
     }
-    l->hand = l->mode == UPPER_MANUAL;
-    if (l->hand) {
-        send(l, l->taken || !l->known);
-    } else { /* the operator says where it stands */
-        for (k = 0; k < UPPER_N_MV; ++k) {
-            l->mv[k] = mv[k];
-        }
-        l->known = 1;
-        l->taken = 0;
-        l->by_hand = 0;
-    }
+    l->hand = 1;
+    send(l, l->taken || !l->known);
     return 1;
 }
 

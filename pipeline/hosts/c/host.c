@@ -638,24 +638,24 @@ static void loop_send(Loop *l, bool wait) {
   }
 }
 
-/* Set points (SP); or the MV (MV) from an operator in MANUAL, to which it goes by at most its max_move a period, or that the
-   plant has, while it is not known. False, and nothing changed, outside the ranges, for the MV in another mode, and after a
-   command that did not arrive. */
+/* Set points (SP); or the MV (MV) from an operator in MANUAL, to which it goes by at most its max_move a period. False, and
+   nothing changed, outside the ranges, for the MV in another mode, and after a command that did not arrive. */
 static bool loop_set(Loop *l, int which, const double *values) {
   const Signals *signals = &l->c->signals[which];
   if (which == MV && l->lost)
     return failed(l->c, "the last MV did not reach the plant, so where the MV stands is not known; wait");
-  if (which == MV && l->mode != MANUAL && !isnan(l->mv[0]))
+  if (which == MV && l->mode != MANUAL)
     return failed(l->c, "the MV is set by hand in MANUAL only; the loop is in %s", MODE[l->mode]);
   for (size_t i = 0; i < signals->n; i++) {
     const Signal *s = &signals->at[i];
     if (!may_be(s, values[i], 0) || (s->values && !among(s, values[i])))
       return failed(l->c, "%s = %g %s is not allowed", s->name, values[i], s->unit);
   }
-  l->hand = which == MV ? l->mode == MANUAL : l->hand;
-  memcpy(which == SP ? l->sp : l->hand ? l->wanted : l->mv, values, signals->n * sizeof *values);
-  if (which == MV && l->hand) loop_send(l, !loop_placed(l));
-  else if (which == MV) l->by_hand = l->taken = false; /* it is where the operator says */
+  memcpy(which == SP ? l->sp : l->wanted, values, signals->n * sizeof *values);
+  if (which == MV) {
+    l->hand = true;
+    loop_send(l, !loop_placed(l));
+  }
   return true;
 }
 
@@ -1098,10 +1098,7 @@ static bool run_kit(Controller *c, Loop *l, const Json *kit, FILE *out, Tally *t
     l->recover_after = (int)json_number(json_get(begin, "recover_after"));
     l->max_gap = json_number(json_get(begin, "max_gap"));
     const double *sp = numbers(json_get(begin, "sp"), c->n_in[SP], room[SP]);
-    const Json *told = json_get(begin, "mv"); /* null: nobody tells where the MV stands */
-    bool untold = told && told->kind == J_NULL;
-    const double *mv = untold ? l->mv : numbers(told, c->n_in[MV], room[MV]);
-    done = sp && mv ? loop_set(l, SP, sp) && (untold || loop_set(l, MV, mv)) : failed(c, "the kit has no start of its loop");
+    done = sp ? loop_set(l, SP, sp) : failed(c, "the kit has no start of its loop"); /* nobody tells where the MV stands */
   }
   if (out && done) fprintf(out, ",\n\"scans\": [");
   for (size_t k = 0; done && k < scans->n; k++) {
