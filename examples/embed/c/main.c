@@ -61,7 +61,7 @@ static void sleep_until(double at_s) {
 
 /* ------------------------------------------------------------------ the loop */
 int main(int n, char **words) {
-  static const char *const MODE[] = {"MANUAL", "AUTO", "HOLD"};
+  static const char *const MODE[] = {"MANUAL", "AUTO", "HOLD", "SHADOW"};
   static law_loop l;
   const long scans = n > 1 ? strtol(words[1], NULL, 10) : 20;
   const double period_s = n > 2 ? strtod(words[2], NULL) : LAW_PERIOD_S, start_s = now_s();

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from loopwright.pipeline.export.plain_code.c_text import PrintedStep
 from loopwright.pipeline.export.plain_code.printed_functions import number
+from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.manifest import INPUTS, SWITCHES, Manifest, Signal
 
 OUTPUTS = ("mv", "state_next", "info")
@@ -52,6 +53,7 @@ def printed_header(head: str, m: Manifest, sha256: str, name: str, step: Printed
         "",
         f'#define {big}_SHA256 "{sha256}"',
         f"#define {big}_PERIOD_S {number(m.period_s)}",
+        f"#define {big}_BRIDGE_S {number(BRIDGE_PERIODS * m.period_s)} /* of a bad reading that is predicted */",
         *numbers,
         *uses,
         f"#define {big}_ROOM(n) ((n) > 0 ? (n) : 1) /* entries of an array that may have none */",

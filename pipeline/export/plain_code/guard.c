@@ -394,7 +394,7 @@ void lower_begin(lower_loop *l, lower_mode mode, long recover_after)
     for (k = 0; k < UPPER_N_OPERATE; ++k) {
         l->operate[k] = UPPER_OPERATE_DEFAULT[k];
     }
-    l->bridge_s = 10.0 * UPPER_PERIOD_S;
+    l->bridge_s = UPPER_BRIDGE_S;
 #endif
 #if UPPER_N_AHEAD > 0
     for (k = 0; k < UPPER_N_AHEAD; ++k) {

@@ -12,9 +12,9 @@ from importlib.resources import files
 
 from loopwright.pipeline.export.structured_text.iec_names import array_of, comment, field_names, lreal
 from loopwright.pipeline.export.structured_text.step_block import StepBlock
+from loopwright.serving.bridging import BRIDGE_PERIODS
 from loopwright.serving.manifest import SWITCHES, Manifest, Signal
 
-BRIDGED_PERIODS = 10.0  # for which a bad reading is predicted at first; as in the loop of the station
 # What stands for each input of a step in the guard.
 _IN_GUARD = {
     "sp": "sp_used", "pv": "pv_used", "dv": "dv", "mv_applied": "applied", "operate": "operate_now",
@@ -37,7 +37,7 @@ def printed_guard(m: Manifest, name: str, step: StepBlock) -> list[str]:
         (r"FLAGS (\w+)", lambda t: f"ARRAY[0..{sizes[t[1].lower()] - 1}] OF BOOL"),
         (r"\bTOP_(\w+)", lambda t: str(sizes[t[1].lower()] - 1)),
         (r"\bN_AHEAD_SIGNALS\b", lambda t: str(sizes["sp"] + sizes["dv"])),
-        (r"\bBRIDGE_S\b", lambda t: lreal(BRIDGED_PERIODS * m.period_s)),
+        (r"\bBRIDGE_S\b", lambda t: lreal(BRIDGE_PERIODS * m.period_s)),
         (r"\bPERIOD_S\b", lambda t: lreal(m.period_s)),
         (r"\bOPERATE_FIELDS\b", lambda t: "\n".join(_fields_read(m))),
         (r"\bPRESENT_VALUE\b", lambda t: _present(sizes)),
