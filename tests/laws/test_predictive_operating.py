@@ -17,6 +17,7 @@ from scipy.optimize import linprog
 
 from loopwright.pipeline.errors import LawError
 from loopwright.pipeline.export.gate import export
+from loopwright.pipeline.laws.predictive import qp_solver
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models.identified.identified import Identified
 from loopwright.pipeline.plants.simulator import Signals
@@ -147,6 +148,31 @@ def test_of_two_ranges_at_odds_the_one_of_the_higher_rank_is_kept(first: str, se
     assert beyond[second] > 0.2
     assert beyond[first] < 0.015 * beyond[second]
     assert not mv[:, 1:].any()
+
+
+def loose(seed: int) -> Identified:
+    """A stable model of 3 outputs and 2 MVs, of poles from .5 to .97, whose outputs answer soon and late."""
+    rng, n = np.random.default_rng(seed), 5
+    into = np.linalg.qr(rng.normal(size=(n, n)))[0] + 0.3 * rng.normal(size=(n, n))
+    a = into @ np.diag(rng.uniform(0.5, 0.97, n)) @ np.linalg.inv(into)
+    return scaled_model(3, 2, 0, n, a=a, b=0.3 * rng.normal(size=(n, 2)), rest=np.eye(n, 6))
+
+
+def travel_at_odds(seed: int) -> float:
+    """Way of the MVs once a range of y2 is at odds with the set points of the others."""
+    law, rng = law_of(loose(seed), horizon=25, operate={}), np.random.default_rng(seed)
+    operate = Operate(law.operate)
+    free = {"u0.max_move": 0.1, "u1.max_move": 0.1, "y2.track": 0}
+    ways = [operate.with_values(v) for v in (free, free | {"y2.low": rng.uniform(0.1, 0.6)})]
+    _, mv = operated(law, loose(seed), 140, rng.uniform(-0.6, 0.6, 3), lambda k: ways[k > 40])
+    return float(np.abs(np.diff(mv, axis=0))[41:].sum())
+
+
+def test_outputs_at_odds_move_the_mvs_less_than_they_could(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds = range(6)
+    calm = sum(map(travel_at_odds, seeds))
+    monkeypatch.setattr(qp_solver, "AT_ODDS", 0.0)
+    assert calm < 0.9 * sum(map(travel_at_odds, seeds))
 
 
 @pytest.mark.parametrize("seed", [3, 12])
