@@ -20,8 +20,8 @@ from loopwright.pipeline.models.memory import Named
 # plan gains by moves for as long as two outputs pull against each other, and would go up and down by the largest move
 # for ever: a tank of three valves does so with 0 to .3 of it, and rests with .4, whatever its speed, moves and horizon.
 AT_ODDS = 0.4
-# The force, in units of an error's weight, from which on outputs count as at odds. Costs move set points with less: with
-# 0 a reactor whose feed is pushed has 12 % more error, with .5 4 %. Other plants of the benchmark hardly differ.
+# The force, in units of an error's weight, from which on outputs count as at odds. Costs move set points with less:
+# with 0 a reactor whose feed is pushed has 12 % more error, with .5 4 %. Other plants of the benchmark hardly differ.
 ODDS_FROM = 0.5
 
 
