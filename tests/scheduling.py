@@ -37,10 +37,14 @@ KEEP_TIME = (
     *("test_page_by_hand_in_browser.py", "test_browser_module.py"),
 )
 LONG = (
-    *("test_laws_contract.py", "test_pipeline.py", "test_real_servers.py", "test_drifts_of_every_case.py"),
-    *("test_screen_by_dvc.py", "test_export_to_controller.py", "test_identified_part.py"),
-    *("test_new.py", "test_tracking.py", "test_embed.py", "test_predictive.py", "test_manual_builds.py"),
-    *("test_fusion.py", "test_c_host.py", "test_cluster_stages.py", "test_cluster.py", "test_node_host.py"),
+    *("test_st_files.py", "test_predictive.py", "test_manual_builds.py", "test_pipeline.py", "test_real_servers.py"),
+    *("test_drifts_of_every_case.py", "test_screen_by_dvc.py", "test_export_to_controller.py", "test_fusing.py"),
+    *("test_webassembly.py", "test_regions.py", "test_step_block.py", "test_mvs_one_by_one.py", "test_fusion.py"),
+    *("test_guard_block.py", "test_predictive_operating.py", "test_tracking.py", "test_local_controllers.py"),
+    *("test_laws_contract.py", "test_dvc_deps.py", "test_embed.py", "test_left_out.py", "test_old_loop.py"),
+    *("test_statements.py", "test_what_if_of_courses.py", "test_identified_part.py", "test_fuzz_of_operate.py"),
+    *("test_workbench.py", "test_cold_starts.py", "test_new.py", "test_cortex_m7.py", "test_excitation.py"),
+    *("test_c_example.py", "test_c_host.py", "test_cluster_stages.py", "test_cluster.py", "test_node_host.py"),
     *("test_laws_that_are_refused.py", "test_controller_fmu.py", "test_report.py", "test_graph_audit.py"),
     *("test_report_of_squared_errors.py", "test_fuzzy_laws.py", "test_commanded_mvs.py", "test_screen.py"),
     *("test_pictures.py", "test_structure_search.py", "test_units_of_laws.py", "test_repeatable.py"),

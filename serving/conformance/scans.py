@@ -31,7 +31,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 KIT_RECOVERY = 3  # good samples in a row after which a loop goes on
 MAX_GAP = 3  # missed periods in a row that a law bridges: after more it starts cold
-PATIENCE = 200  # samples of a shadow, in all, that a law may refuse
+MOST_WAITS = 200  # samples of a shadow, in all, that a law may refuse
 ACTUATOR_STANDS = 0.3  # share of its range at which an actuator stands before the loop's first command: not its middle
 
 
@@ -100,7 +100,7 @@ def scanned(controller: Controller) -> list[Scanned]:
                 loop.set_mode(scan.set_mode)
             except LoopError:  # the law has refused the last sample of the shadow that is to end
                 waited += 1
-                if waited > PATIENCE:
+                if waited > MOST_WAITS:
                     raise
                 now = KitScan("others have the plant until the law takes a sample", course.sample(stands))
         if now.set_mv is not None:
@@ -184,15 +184,15 @@ def _scans(m: Manifest, good: Sample, told: tuple[Sample, Sample]) -> Generator[
 
 # ---------------------------------------------------------------------------------------------- a cold start that shows
 RESTS = 6  # good samples over which the PVs rest before a cold start
-TRIALS = 256
+DRAWS = 256  # of a rest and a jump; a law whose MV lies at its ends shows its past in 2 % of them
 
 
 def _before_and_after(controller: Controller, sp: Array) -> tuple[Sample, Sample]:
     """A sample that rests, and one after it whose MV tells most whether the law began cold there.
 
-    Samples at random leave a law at an end of its MV's range, where a start that is not cold gives the same MV. Of
-    ``TRIALS`` rests and jumps of the PVs the one is taken after which the MVs, as shares of their ranges, differ most
-    between a step from the rest's state and a step from the cold state. Without a state there is nothing to tell.
+    Samples at random leave a law at an end of its MV's range, where a start that is not cold gives the same MV. The
+    MVs of a step from the rest's state and of one from the cold state differ by a share of their ranges: the rest and
+    jump of the PVs with the largest share is taken out of ``DRAWS``. Without a state there is nothing to tell.
     """
     m, rng = controller.manifest, np.random.default_rng(2)
     span = np.array([s.high - s.low for s in m.mv])
@@ -200,7 +200,7 @@ def _before_and_after(controller: Controller, sp: Array) -> tuple[Sample, Sample
     width = np.array([0.0 if s.values else s.high - s.low for s in m.pv])
     rest = Sample(pv=middle, mv_applied=actuators(m), dv=np.array([s.middle for s in m.dv], dtype=np.float64))
     told, most = (rest, rest), 0.0
-    for k in range(TRIALS if m.n_state else 0):
+    for k in range(DRAWS if m.n_state else 0):
         wide = (0.05, 0.2, 0.5, 1.0)[k % 4] * width
         pv = middle + wide * rng.uniform(-0.5, 0.5, len(width))
         jumped = np.clip(pv + 0.2 * wide * rng.uniform(-1, 1, len(width)), middle - 0.5 * width, middle + 0.5 * width)

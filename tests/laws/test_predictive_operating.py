@@ -171,7 +171,7 @@ def travel_at_odds(seed: int) -> float:
 def test_outputs_at_odds_move_the_mvs_less_than_they_could(monkeypatch: pytest.MonkeyPatch) -> None:
     seeds = range(6)
     calm = sum(map(travel_at_odds, seeds))
-    monkeypatch.setattr(qp_solver, "AT_ODDS", 0.0)
+    monkeypatch.setattr(qp_solver, "CALM", 0.0)
     assert calm < 0.9 * sum(map(travel_at_odds, seeds))
 
 

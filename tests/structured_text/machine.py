@@ -14,7 +14,7 @@ from typing import Any
 
 from blark import transform as tree
 
-from structured_text.source import Statements, Unit, stand_in, units_of
+from structured_text.source import Statement, Unit, stand_in, units_of
 
 ZEROS = {"LREAL": 0.0, "DINT": 0, "INT": 0, "BOOL": False}
 COMPARED = {"=": "==", "<>": "!=", "<": "<", "<=": "<=", ">": ">", ">=": ">="}
@@ -138,54 +138,55 @@ class _Compiler:
         yield "    return"
 
     def body(self) -> Iterator[str]:
-        for statements in self.unit.statements:
-            yield from self.numbered(statements)
+        yield from self.block(self.unit.statements, "    ")
 
-    def numbered(self, statements: Statements) -> Iterator[str]:
+    def block(self, statements: tuple[Statement, ...], indent: str) -> Iterator[str]:
         """Statements with their own numbers again."""
-        self.there = {stand_in(k, n): n for k, n in enumerate(statements.numbers)}
-        for s in statements.parsed:
-            for line in self.statement(s, "    "):
-                yield self.again(line)
+        for s in statements:
+            self.there = {stand_in(k, n): n for k, n in enumerate(s.numbers)}
+            if not s.held:
+                yield from [indent + self.again(line) for line in self.statement(s.parsed)]
+                continue
+            heads = [self.again(head) for head in self.heads(s.parsed)]
+            for head, held in zip(heads, s.held, strict=True):
+                yield f"{indent}{head}:"
+                yield from self.block(held, indent + "    ")
+        if not statements:
+            yield f"{indent}pass"
 
     def again(self, text: str) -> str:
         """A text with the numbers that stood in it."""
         return re.sub(r"(?<![A-Za-z\d.])987654\d\d\d(\.5)?(?!\d)", lambda found: self.there[found[0]], text)
 
-    def block(self, statements: Any, indent: str) -> Iterator[str]:
-        found = [] if statements is None else statements.statements
-        for s in found:
-            yield from self.statement(s, indent + "    ")
-        if not found:
-            yield f"{indent}    pass"
+    def heads(self, s: Any) -> Iterator[str]:
+        """A loop, or the ways of a branch, without what they hold."""
+        if isinstance(s, tree.ForStatement):
+            i, kind = self.variable(s.control)
+            first, last = self.of(s.from_), self.of(s.to)
+            assert kind == first[1] == last[1] == "DINT", s
+            assert s.step is None
+            yield f"for {i} in range({first[0]}, ({last[0]}) + 1)"
+        elif isinstance(s, tree.IfStatement):
+            yield f"if {self.truth(s.if_expression)}"
+            for other in s.else_ifs:
+                yield f"elif {self.truth(other.if_expression)}"
+            if s.else_clause is not None:
+                yield "else"
+        else:
+            raise NotImplementedError(type(s).__name__)
 
-    def statement(self, s: Any, indent: str) -> Iterator[str]:
+    def statement(self, s: Any) -> Iterator[str]:
+        """A statement that holds no others."""
         if isinstance(s, tree.AssignmentStatement):
             (variable,) = s.variables
             target, kind = self.variable(variable)
             value, given = self.of(s.expression)
             assert kind == given, f"{s}: {kind} := {given}"
             whole = kind.startswith("[")
-            yield f"{indent}{target}[:] = {value}" if whole else f"{indent}{target} = {value}"
-        elif isinstance(s, tree.ForStatement):
-            i, kind = self.variable(s.control)
-            first, last = self.of(s.from_), self.of(s.to)
-            assert kind == first[1] == last[1] == "DINT", s
-            assert s.step is None
-            yield f"{indent}for {i} in range({first[0]}, ({last[0]}) + 1):"
-            yield from self.block(s.statements, indent)
-        elif isinstance(s, tree.IfStatement):
-            yield f"{indent}if {self.truth(s.if_expression)}:"
-            yield from self.block(s.statements, indent)
-            for other in s.else_ifs:
-                yield f"{indent}elif {self.truth(other.if_expression)}:"
-                yield from self.block(other.statements, indent)
-            if s.else_clause is not None:
-                yield f"{indent}else:"
-                yield from self.block(s.else_clause.statements, indent)
+            yield f"{target}[:] = {value}" if whole else f"{target} = {value}"
         elif isinstance(s, tree.ReturnStatement):
             assert self.unit.kind == "FUNCTION"
-            yield f"{indent}return {self.name}"
+            yield f"return {self.name}"
         elif isinstance(s, tree.FunctionCallStatement):
             target, kind = self.variable(s.name)
             fields = self.machine.fields[kind.lower()]
@@ -193,8 +194,8 @@ class _Compiler:
                 value, given = self.of(p.value)
                 name = str(p.name).lower()
                 assert fields[name] == given, f"{s}: {name}"
-                yield f"{indent}{target}.{name}{'[:]' if given.startswith('[') else ''} = {value}"
-            yield f"{indent}{target}.run()"
+                yield f"{target}.{name}{'[:]' if given.startswith('[') else ''} = {value}"
+            yield f"{target}.run()"
         else:
             raise NotImplementedError(type(s).__name__)
 

@@ -2,7 +2,9 @@
 
 A list of many numbers takes that parser minutes: of each kind of array it parses a list of two, and here every list is
 read number by number, each as a literal of IEC 61131-3. Statements that differ in their numbers alone, those in names
-included, are parsed once: the numbers of a statement are taken out of its text, and stand in ``Statements.numbers``.
+included, are parsed once: the numbers of a statement are taken out of its text, and stand in ``Statement.numbers``. So
+are loops and branches that differ in what they hold: each is parsed with ``HELD`` in the place of its statements, which
+are parsed by themselves.
 """
 
 from __future__ import annotations
@@ -22,15 +24,20 @@ LIST = re.compile(r"(?P<name>\w+) : ARRAY\[0\.\.(?P<last>\d+)\] OF (?P<of>\w+) :
 ARRAY_TYPE = re.compile(r"^TYPE (?P<name>\w+) : (?P<array>ARRAY\[0\.\.\d+\] OF (?:LREAL|DINT|BOOL));\nEND_TYPE$", re.M)
 LITERAL = re.compile(r"-?\d+\.\d+(E[+-]\d\d+)?|-?\d+|TRUE|FALSE")
 FIRST = 987654000  # of the numbers that stand for others
+WAYS, HELD = re.compile(r"(ELSIF|ELSE)\b"), "it_holds := TRUE;"
 BEGINS, ENDS = re.compile(r"(FOR|IF|CASE|WHILE|REPEAT)\b"), re.compile(r"END_(FOR|IF|CASE|WHILE|REPEAT)\b")
 
 
 @dataclass(frozen=True)
-class Statements:
-    """blark's statements of a text whose k-th number was replaced by ``stand_in(k, it)``, and the numbers."""
+class Statement:
+    """blark's statement of a text whose k-th number was replaced by ``stand_in(k, it)``, and the numbers.
 
-    parsed: tuple[Any, ...]
+    A loop has its statements in ``held``, a branch those of each of its ways.
+    """
+
+    parsed: Any
     numbers: tuple[str, ...]
+    held: tuple[tuple[Statement, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -40,8 +47,8 @@ class Unit:
     kind: str
     name: str
     returns: str | None  # type of a function
-    declarations: tuple[tuple[str, Any, str], ...]  # VAR_INPUT and so on, blark's block of one, the name of a list
-    statements: tuple[Statements, ...]
+    declarations: tuple[tuple[str, Any, str], ...]  # VAR_INPUT and so on, blark's block of one, the variable's name
+    statements: tuple[Statement, ...]
     lists: dict[str, list[float]]
 
 
@@ -77,7 +84,7 @@ def _unit(text: str) -> Unit:
         assert len(texts) == int(found["last"]) + 1, found["name"]
         lists[found["name"]] = [t == "TRUE" if t in ("TRUE", "FALSE") else _number(t) for t in texts]
         few = {"LREAL": "-1.5, 2.0E-05", "DINT": "-1, 2", "BOOL": "TRUE, FALSE"}[found["of"]]
-        return f"a_list : ARRAY[0..1] OF {found['of']} := [{few}];"
+        return f"a_name : ARRAY[0..1] OF {found['of']} := [{few}];"
 
     kind, name, returns = re.match(r"(\w+)\s+(\w+)(?: : (\w+))?", text).groups()  # type: ignore[union-attr]
     if kind == "TYPE":
@@ -94,11 +101,11 @@ def _unit(text: str) -> Unit:
         elif line == "END_VAR":
             room = ""
         else:
-            short = LIST.sub(shortened, line)
+            short = re.sub(r"^\w+ :", "a_name :", LIST.sub(shortened, line))
             whole = f"FUNCTION_BLOCK x_block\n{room}\n{short}\nEND_VAR\n;\nEND_FUNCTION_BLOCK\n"
             (block,) = parsed(whole, "iec_source").items[0].declarations
-            blocks.append((room, block, line.split()[0] if short != line else ""))
-    statements = tuple(_statements(piece) for piece in _pieces(lines[last + 1 : -1]))
+            blocks.append((room, block, line.split()[0]))
+    statements = _statements(lines[last + 1 : -1])
     return Unit(kind, name, returns, tuple(blocks), statements, lists)
 
 
@@ -118,22 +125,46 @@ def stand_in(k: int, number: str) -> str:
     return f"{FIRST + k}.5" if "." in number else str(FIRST + k)
 
 
-def _statements(text: str) -> Statements:
+def _statements(lines: list[str]) -> tuple[Statement, ...]:
+    return tuple(_statement(piece) for piece in _pieces(lines))
+
+
+def _statement(lines: list[str]) -> Statement:
     numbers: list[str] = []
 
     def taken(found: re.Match[str]) -> str:
         numbers.append(found[0])
         return stand_in(len(numbers) - 1, found[0])
 
+    lines, held = _apart([word for line in lines if (word := line.strip())])
+    text = "\n".join(lines) + "\n"
     shape = re.sub(r"(?<![A-Za-z\d.])\d+(\.\d+(E[+-]\d\d+)?)?", taken, text)
-    return Statements(tuple(parsed(shape, "statement_list").statements), tuple(numbers))
+    (found,) = parsed(shape, "statement_list").statements
+    return Statement(found, tuple(numbers), held)
+
+
+def _apart(lines: list[str]) -> tuple[list[str], tuple[tuple[Statement, ...], ...]]:
+    """A loop or a branch with ``HELD`` in each place of statements, and those; anything else as it is."""
+    if not BEGINS.match(lines[0]):
+        return lines, ()
+    heads, held = [lines[0]], [list[str]()]
+    depth = 0
+    for line in lines[1:-1]:
+        if depth == 0 and WAYS.match(line):
+            heads.append(line)
+            held.append([])
+            continue
+        depth += bool(BEGINS.match(line)) - bool(ENDS.match(line))
+        held[-1].append(line)
+    whole = [text for head in heads for text in (head, HELD)]
+    return [*whole, lines[-1]], tuple(_statements(body) for body in held)
 
 
 def _number(text: str) -> float:
     return int(text) if re.fullmatch(r"-?\d+", text) else float(text)
 
 
-def _pieces(lines: list[str]) -> Iterator[str]:
+def _pieces(lines: list[str]) -> Iterator[list[str]]:
     """Whole statements."""
     held: list[str] = []
     depth = 0
@@ -142,9 +173,9 @@ def _pieces(lines: list[str]) -> Iterator[str]:
         word = line.strip()
         depth += bool(BEGINS.match(word)) - bool(ENDS.match(word))
         if depth == 0 and word.endswith(";"):
-            yield "\n".join(held) + "\n"
+            yield held
             held = []
-    assert not held, held
+    assert not any(line.strip() for line in held), held
 
 
 @cache

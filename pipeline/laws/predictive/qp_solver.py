@@ -16,13 +16,17 @@ from loopwright.pipeline.laws.predictive.horizon import LinearHorizon, Moves, Ne
 from loopwright.pipeline.laws.predictive.soft_limits import EPS, SOFT, LimitCost, SoftLimits, limit_cost
 from loopwright.pipeline.models.memory import Named
 
-# What the moves' cost grows by where outputs are at odds, for each sample of the horizon and unit of their force. A
-# plan gains by moves for as long as two outputs pull against each other, and would go up and down by the largest move
-# for ever: a tank of three valves does so with 0 to .3 of it, and rests with .4, whatever its speed, moves and horizon.
-AT_ODDS = 0.4
+# The moves' cost grows by it where ranges are at odds with other outputs, for each sample of the horizon and unit of
+# their force. A plan gains by moves for as long as two outputs pull against each other, and would go up and down by the
+# largest move for ever: a tank of three valves does so with 0 to .3 of it, and rests with .4, whatever its speed, moves
+# and horizon; so does an exchanger of which two ranges are at odds.
+CALM = 0.4
 # The force, in units of an error's weight, from which on outputs count as at odds. Costs move set points with less:
-# with 0 a reactor whose feed is pushed has 12 % more error, with .5 4 %. Other plants of the benchmark hardly differ.
+# with 0 a reactor whose feed is pushed has 12 % more error, with .5 4 %.
 ODDS_FROM = 0.5
+# The largest force that counts, in the same units: a set point's own. Two ranges pull up to 3,000 times as hard, and
+# with all of it the law would leave loads alone where ranges of two variables are near their ends.
+MOST_ODDS = 1.0
 
 
 class OperatedPlan(NamedTuple):
@@ -136,6 +140,7 @@ class Planner(nn.Module):
     damping: Tensor  # (1,) kappa
     calm: Tensor  # (1,) growth of the moves' cost where outputs are at odds
     odds_from: Tensor  # (1,) least force of it
+    most_odds: Tensor  # (1,) largest force of it
     soft: Tensor  # (1,) of the price of a range
     blunt: Tensor  # (1,) of the price of a range
 
@@ -172,8 +177,8 @@ class Planner(nn.Module):
         for name, values in buffers.items():
             self.register_buffer(name, values)
         hold_numbers(self, weights=[list(cost.weights) * moves.horizon], eps_squared=cost.eps**2, damping=cost.damping)
-        calm = AT_ODDS * moves.horizon / cost.move
-        hold_numbers(self, calm=calm, odds_from=ODDS_FROM, soft=SOFT, blunt=EPS)
+        calm = CALM * moves.horizon / cost.move
+        hold_numbers(self, calm=calm, odds_from=ODDS_FROM, most_odds=MOST_ODDS, soft=SOFT, blunt=EPS)
 
     def forward(
         self,
@@ -231,10 +236,11 @@ class Planner(nn.Module):
 
         t is the weight of a set point over the designed one, 0 where none is followed, b_o what lies beyond the range
         of output o, p_o the cost of ``SoftLimits`` with its price by rank, s the stiffness, N the samples of the
-        horizon, and sigma ``AT_ODDS``; delta and eps of a price are larger by ``blurred``. A set point outside its
-        range counts as the end of it. f sums the forces of set points and ranges on the outputs at the end of the
-        horizon, at the present plan, each less ``ODDS_FROM``, without the largest: 0 where a plan brings all outputs,
-        or all but one, where they should be. What is left pulls for ever, so that moves must cost as much more.
+        horizon, and sigma ``CALM``; delta and eps of a price are larger by ``blurred``. A set point outside its
+        range counts as the end of it. f is the force by which ranges are at odds with other outputs at the end of the
+        horizon, at the present plan: the lesser of all forces of ranges, and of all of ranges and set points without
+        the largest, each less ``ODDS_FROM``; ``MOST_ODDS`` at most. It is 0 where a plan brings all outputs, or all but
+        one, where they should be. Where it does not they pull for ever, so that moves must cost as much more.
         """
         away, going_on = by.rest_weight * self.eye, applied @ self.applied
         wanted, weights = torch.minimum(torch.maximum(wanted, by.low), by.high), self.weights * by.track
@@ -252,8 +258,10 @@ class Planner(nn.Module):
             push = limit_cost(run.y, by.low_inside, by.high_inside, by.price, soft, blunt * blunt)
             both = weight + push.weight
             back = both * (plan @ run.slopes) - weight * error - push.slope - by.y_cost
-            force = torch.clamp((weight * error + push.slope)[..., -self.n_cv :].abs() - self.odds_from, min=0.0)
-            at_odds = force.sum(dim=-1, keepdim=True) - force.amax(dim=-1, keepdim=True)
+            ranges = torch.clamp(push.slope[..., -self.n_cv :].abs() - self.odds_from, min=0.0)
+            force = ranges + torch.clamp((weight * error)[..., -self.n_cv :].abs() - self.odds_from, min=0.0)
+            others = force.sum(dim=-1, keepdim=True) - force.amax(dim=-1, keepdim=True)
+            at_odds = torch.clamp(torch.minimum(others, ranges.sum(dim=-1, keepdim=True)), max=self.most_odds)
             stiffness = by.stiffness + self.calm * at_odds
             stiff = stiffness * self.moved + away
             held = stiffness * going_on + by.rest_weight * by.rest - by.z_cost
