@@ -59,7 +59,7 @@ bench: $(STAMP) ## run the benchmarks, about 15 minutes
 
 release: $(STAMP) ## build wheel, source archive, bill of materials and licences into dist/, run tests/release: 11 minutes
 	@PYTHON=python bash tools/release.sh
-	python -m pytest tests/release
+	python -m pytest -n 2 --dist loadfile --no-loadscope-reorder tests/release
 
 clean: ## remove what can be rebuilt (the virtual environment stays)
 	rm -rf work timing receipts published.json mlflow.db mlruns mlartifacts .pytest_cache .mypy_cache .ruff_cache build dist

@@ -38,7 +38,7 @@ static int start(Controller *c) {
   loop_scan(&l, &no_read_back);
   MUST(!loop_writes(&l)); /* the plant reads back, and it stands elsewhere */
   loop_close(&l);
-  MUST(loop_open(&l, c, AUTO, 2) && loop_set(&l, MV, mv) && loop_writes(&l)); /* or what the plant has at the start */
+  MUST(loop_open(&l, c, AUTO, 2) && !loop_set(&l, MV, mv) && !loop_writes(&l)); /* the law has it */
   loop_close(&l);
   controller_cold(c);
   return 0;
