@@ -119,18 +119,8 @@ def test_valves_rest_where_a_range_and_a_set_point_are_at_odds(folder: Path, mon
     monkeypatch.chdir(folder)
     changes = ("LIC-2.track=false", "LIC-2.low=35", "LIC-2.high=45", "FV-2.high=33@600", "FI-4.low=7@1200")
     given = [word for change in changes for word in ("--operate", change)]
-    wanted = [
-        "--sp",
-        "TIC-1=46",
-        "--sp",
-        "LIC-2=40",
-        "--duration",
-        "3600",
-        "--picture",
-        "odds.png",
-        "--csv",
-        "odds.csv",
-    ]
+    wanted = ["--sp", "TIC-1=46", "--sp", "LIC-2=40", "--duration", "3600"]
+    files = ["--picture", "odds.png", "--csv", "odds.csv"]
     assert main(["simulate", "artifacts/basin/predictive.onnx", *given, *wanted, *files]) == 0
     rows = np.genfromtxt("odds.csv", delimiter=",", names=True, deletechars="", usecols=range(13))
     of = {tag: rows[next(n for n in rows.dtype.names if n.startswith(tag))][-60:] for tag in ("FI-4", "FV-1", "FV-3")}
