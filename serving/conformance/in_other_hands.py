@@ -79,14 +79,12 @@ def never_read_back(m: Manifest, good: Sample, recovery: int) -> Scans:
     good = yield KitScan(f"{lost}: a sample is too old", old(none(good)), unwritten=True)
     for _ in range(recovery + 1):
         good = yield KitScan(f"after {lost}", none(good))
-    good = yield KitScan(NOT_FINITE, _not_finite(good), unwritten=True)
-    good = yield KitScan("no read-back after a bad one: not known where the MV stands", none(good))
+    good = yield from _forgotten(good)
     unknown = "by hand from nowhere known, on a plant that reads back"
     good = yield KitScan(f"{unknown}: no sample", None, Mode.MANUAL, set_mv=at(m, 0.9))
     good = yield KitScan(f"{unknown}: a sample is too old", old(none(good)))
     good = yield KitScan(f"{unknown}: a good sample without a read-back", none(good))
-    good = yield KitScan(NOT_FINITE, _not_finite(good), unwritten=True)
-    good = yield KitScan("no read-back after a bad one: not known where the MV stands", none(good))
+    good = yield from _forgotten(good)
     if apart(m):
         return good
     for bad, words in ((partial(outside, m), "outside"), (_not_finite, "not finite")):
@@ -95,6 +93,12 @@ def never_read_back(m: Manifest, good: Sample, recovery: int) -> Scans:
         )
         good = yield KitScan(f"by hand, and no read-back after one {words}", none(good))
     return good
+
+
+def _forgotten(good: Sample) -> Scans:
+    """A command did not arrive, and the read-back after it is bad: then nobody knows where the MV stands."""
+    good = yield KitScan(NOT_FINITE, _not_finite(good), unwritten=True)
+    return (yield KitScan("no read-back after a bad one: not known where the MV stands", no_read_back(good)))
 
 
 def _not_finite(sample: Sample) -> Sample:
@@ -219,8 +223,7 @@ def by_hand(m: Manifest, good: Sample, recovery: int) -> Scans:
     # A bad read-back: the old MV is nothing to go back to.
     for mode in (Mode.MANUAL, Mode.AUTO):
         good = yield KitScan(f"in {mode}", good, set_mode=mode)
-        good = yield KitScan(NOT_FINITE, _not_finite(good), unwritten=True)
-        good = yield KitScan("no read-back after a bad one: not known where the MV stands", none(good))
+        good = yield from _forgotten(good)
         yield from on(recovery + 1, "read back again")
     return good
 

@@ -31,7 +31,7 @@ Array: TypeAlias = NDArray[np.float64]
 
 KIT_RECOVERY = 3  # good samples in a row after which a loop goes on
 MAX_GAP = 3  # missed periods in a row that a law bridges: after more it starts cold
-MOST_WAITS = 200  # samples of a shadow, in all, that a law may refuse
+MOST_WAITS = 200  # samples of a shadow, in all, that a law may refuse: half as many as a kit has scans
 ACTUATOR_STANDS = 0.3  # share of its range at which an actuator stands before the loop's first command: not its middle
 
 
@@ -183,7 +183,7 @@ def _scans(m: Manifest, good: Sample, told: tuple[Sample, Sample]) -> Generator[
 
 
 # ---------------------------------------------------------------------------------------------- a cold start that shows
-RESTS = 6  # good samples over which the PVs rest before a cold start
+RESTS = 6  # good samples over which the PVs rest before a cold start: more of a past than one sample
 DRAWS = 256  # of a rest and a jump; a law whose MV lies at its ends shows its past in 2 % of them
 
 
