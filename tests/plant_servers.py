@@ -31,6 +31,7 @@ from loopwright.serving.station.station import Station
 ROOT = Path(__file__).parents[1]
 UNKNOWN = "where the MV stands is not known"  # why a loop that has just lost its plant refuses for some scans
 CASE, PID = "thiosulfate_cstr", ROOT / "artifacts" / "thiosulfate_cstr" / "pid.onnx"
+MARK = "read by a test"  # a text that the journal keeps
 SPACE = "nsu=urn:loopwright:plant;s="
 LOOP = """
 controller = "{pid}"
@@ -166,6 +167,7 @@ class RunningLoop:
         self.settings = Settings.read(settings) if isinstance(settings, Path) else settings
         self.told: list[str] = []
         self.commands: list[Command] = []
+        self.marks = 0  # in the journal
         where = self.settings  # loaded here: no process has to try the first steps of a test's file
         loaded = Controller(where.controller, where.sha256 or None, where.trusted)
         self.station = Station(where, tell=self.told.append, controller=loaded)
@@ -215,14 +217,32 @@ class RunningLoop:
         assert within(seconds, there), (mode, self.told, [(c.mode, c.fault) for c in self.commands[start:]][-10:])
         return next(i for i, c in enumerate(self.commands[start:]) if c.mode is mode)
 
+    def _written(self) -> None:
+        """Wait until the journal, which gathers for a while, has written what it was given up to now."""
+        if self.thread.is_alive():
+            self.marks += 1
+            self.station.journal.keep(MARK, str(self.marks))
+            assert within(20, lambda: self._marked() or not self.thread.is_alive()), self.told
+
+    def _marked(self) -> bool:
+        with closing(JournalReader(self.settings.journal.file)) as reader:
+            return reader.learnt(MARK) == str(self.marks)
+
     def scans(self) -> list[ScanEntry]:
         """What its journal holds."""
+        self._written()
         with closing(JournalReader(self.settings.journal.file)) as reader:
             return [scan for _, _, scan in reader.scans()]
 
     def events(self) -> list[str]:
+        """What its journal says of changes, faults and alarms."""
+        self._written()
         with closing(JournalReader(self.settings.journal.file)) as reader:
             return [f"{e.kind} {e.who}: {e.what}" for _, e in reader.events()]
+
+    def changes(self, begin: str, who: str = "anna") -> list[str]:
+        """The changes by somebody whose words begin so."""
+        return [line for line in self.events() if line.startswith(f"change {who}: {begin}")]
 
     def end(self) -> None:
         self.station.end()
