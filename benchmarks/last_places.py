@@ -2,8 +2,8 @@
 
 ``python benchmarks/last_places.py [--points N] [--compiler "gcc -O2"]``: the functions as a controller's text has them,
 compiled once; for each the largest error over N results (1,000,000), and where it is. Softmax is the statements that a
-Softmax of a graph becomes, of rows of 5 and of 3 numbers, over three spreads: its largest exponent is subtracted, so
-that a result far below 1 has the rounding of that difference in it; onnxruntime's own stands beside it. About a minute
+Softmax of a graph becomes, of rows of 5 and of 3 numbers, over three spreads; onnxruntime's own stands beside it: the
+largest exponent is subtracted there, and a result far below 1 has the rounding of that difference in it. About a minute
 a million results of a function on one core, two of a softmax.
 """
 

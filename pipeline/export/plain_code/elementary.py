@@ -1,13 +1,15 @@
-"""exp, log and tanh from + - * / alone, so that every processor computes the same bits.
+"""exp, log, tanh and what a softmax takes from + - * / alone, so that every processor computes the same bits.
 
 A standard library's functions differ in their last bits from one system to the next. These are written in the few words
 of Python that ``printed_functions`` puts into C, operation by operation: the Python text is the formula, the
 reference of the tests, and the source of every printed text. Arithmetic is that of IEEE 754 with 53 bits, without
-contraction. Each result is within one unit of its last place (``benchmarks/plain_code.py`` measures it). A result too
-large for a double is ``LARGEST``, with its sign.
+contraction. Each result is within one unit of its last place (``benchmarks/last_places.py`` measures it). A result too
+large for a double is ``LARGEST``, with its sign. A softmax is as exact since its exponents, their exponentials and the
+sum of these are kept in two parts: a double, and what it lacks, the rest.
 
-Source: reduction and reconstruction as in Muller, Elementary Functions, 3rd ed., chapters 5 and 11. The coefficients
-are interpolants at Chebyshev nodes, made with 60 digits.
+Source: reduction and reconstruction as in Muller, Elementary Functions, 3rd ed., chapters 5 and 11; sums and products in
+two parts as in Dekker, Numerische Mathematik 18, 1971. The coefficients are interpolants at Chebyshev nodes, made with
+60 digits.
 """
 
 from __future__ import annotations
@@ -43,6 +45,9 @@ OFFSET = 1088.0  # twice 544: powers of 2 count from it, so that no integer is n
 DOUBLINGS = (512.0, 256.0, 128.0, 64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)
 UP = tuple(2.0**i for i in DOUBLINGS)
 DOWN = tuple(2.0**-i for i in DOUBLINGS)
+SPLIT = 134217729.0  # 2^27 + 1: a double times it gives the double's upper 26 bits
+# 1.5 * 2^12: a number of [0, 1] plus it, less it, is a multiple of 2^-40, of which 4,096 have an exact sum
+GRID = 6144.0
 
 
 def plain_exp(x: float) -> float:
@@ -66,6 +71,52 @@ def plain_exp(x: float) -> float:
     half: int = k // 2
     rest: int = k - half
     return (1.0 + t) * (COARSE[half // 32] * FINE[half % 32]) * (COARSE[rest // 32] * FINE[rest % 32])
+
+
+def plain_exp_rest(x: float, rest: float) -> float:
+    """What ``plain_exp(x)`` lacks of the exponential of x + rest; 0 where x is no argument of it."""
+    if x != x:  # NaN
+        return 0.0
+    if x >= MOST_EXP:
+        return 0.0
+    if x <= LEAST_EXP:
+        return 0.0
+    n: float = (x * LOG2_E + SHIFT) - SHIFT
+    high: float = x - n * LN2_HIGH
+    low: float = n * LN2_LOW
+    r: float = high - low
+    q: float = EXP[10]
+    for i in range(10):
+        q = q * r + EXP[9 - i]
+    c: float = ((high - r) - low) + r * r * q
+    t: float = r + c
+    one: float = 1.0 + t
+    left: float = (t - (one - 1.0)) + (c - (t - r)) + rest * one
+    k: int = int(n + OFFSET)
+    half: int = k // 2
+    part: int = k - half
+    return left * (COARSE[half // 32] * FINE[half % 32]) * (COARSE[part // 32] * FINE[part % 32])
+
+
+def plain_difference_rest(above: float, below: float) -> float:
+    """What the double above - below lacks of the difference."""
+    d: float = above - below
+    back: float = d - above
+    return (above - (d - back)) - (below + back)
+
+
+def plain_quotient(above: float, above_rest: float, below: float, below_rest: float) -> float:
+    """(above + above_rest) / (below + below_rest), each a double and what it lacks."""
+    found: float = above / below
+    wide: float = found * SPLIT
+    head: float = wide - (wide - found)
+    tail: float = found - head
+    broad: float = below * SPLIT
+    upper: float = broad - (broad - below)
+    lower: float = below - upper
+    product: float = found * below
+    lacks: float = ((head * upper - product) + head * lower + tail * upper) + tail * lower
+    return found + (((above - product) - lacks) + (above_rest - found * below_rest)) / below
 
 
 def plain_log(x: float) -> float:

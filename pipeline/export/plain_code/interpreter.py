@@ -10,14 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from loopwright.pipeline.export.plain_code.elementary import plain_exp, plain_log, plain_tanh
+from loopwright.pipeline.export.plain_code.elementary import (
+    plain_difference_rest,
+    plain_exp,
+    plain_exp_rest,
+    plain_log,
+    plain_quotient,
+    plain_tanh,
+)
 from loopwright.pipeline.export.plain_code.statements import Floats, Place, Places, PlainProgram, PlainStatement
 
 
-def _each(function: Callable[[float], float]) -> Callable[[Floats], Floats]:
-    def of_all(x: Floats) -> Floats:
-        found = np.array([function(v) for v in x.ravel().tolist()])
-        return found.reshape(x.shape)
+def _each(function: Callable[..., float]) -> Callable[..., Floats]:
+    def of_all(*args: Floats) -> Floats:
+        same = np.broadcast_arrays(*args)
+        found = np.array([function(*values) for values in zip(*(a.ravel().tolist() for a in same), strict=True)])
+        return found.reshape(same[0].shape)
 
     return of_all
 
@@ -40,6 +48,9 @@ _MEANING: dict[str, Callable[..., Floats]] = {
     "exp": _each(plain_exp),
     "log": _each(plain_log),
     "tanh": _each(plain_tanh),
+    "difference_rest": _each(plain_difference_rest),
+    "exp_rest": _each(plain_exp_rest),
+    "quotient": _each(plain_quotient),
     "not": _truth(lambda a: a == 0.0),
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,

@@ -13,7 +13,10 @@ from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Pla
 WIDTH = 100  # characters of a line of numbers
 COUNTERS, ROUND_COUNTERS = "ijklmn", "rqp"  # of loops and of rounds, outer ones first
 EXTREMES: Mapping[str, str] = {"largest": "max", "least": "min"}
-OWN: Mapping[str, str] = {"exp": "plain_exp", "log": "plain_log", "tanh": "plain_tanh"}
+# Operations that are functions of ``elementary``.
+OWN: Mapping[str, str] = {
+    op: f"plain_{op}" for op in ("exp", "log", "tanh", "difference_rest", "exp_rest", "quotient")
+}
 INFIX: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
 

@@ -12,6 +12,7 @@ import onnx
 from onnx import numpy_helper
 
 from loopwright.pipeline.errors import ExportError
+from loopwright.pipeline.export.plain_code.elementary import GRID
 from loopwright.pipeline.export.plain_code.interpreter import run_statement
 from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, Places, PlainProgram, PlainStatement
 from loopwright.pipeline.export.plain_code.views import View
@@ -25,6 +26,7 @@ ONE_OF_TWO = {
     "Less": "less", "LessOrEqual": "less_equal", "Mul": "mul", "Or": "or", "Sub": "sub",
 }  # fmt: skip
 WHOLE = (onnx.TensorProto.BOOL, onnx.TensorProto.INT64, onnx.TensorProto.INT32)
+MOST_SUMMED = 4096  # multiples of 2^-40 up to 1, see ``elementary.GRID``
 REDUCED = {"ReduceSum": "sum", "ReduceSumSquare": "sum_squares", "ReduceMax": "largest", "ReduceMin": "least"}
 
 
@@ -348,10 +350,19 @@ class Lowering:
         return target
 
     def _softmax(self, node: onnx.NodeProto, args: list[View], given: dict[str, Any]) -> list[View]:
+        """In two parts, a double and what it lacks; the sum of upper bits alone is exact (``elementary.GRID``)."""
         view = args[0]
         axes = [given.get("axis", -1) % len(view.shape)]
-        grown = self._each("exp", [self._each("sub", [view, self._together("largest", view, axes)])])
-        return [self._each("div", [grown, self._together("sum", grown, axes)])]
+        if view.shape[axes[0]] > MOST_SUMMED:
+            raise KeyError(f"Softmax of {view.shape[axes[0]]} numbers, and {MOST_SUMMED} at most are summed exactly")
+        largest, grid = self._together("largest", view, axes), self._hold(f"grid of {node.output[0]}", np.array(GRID))
+        below = self._each("sub", [view, largest])
+        grown = self._each("exp", [below])
+        rest = self._each("exp_rest", [below, self._each("difference_rest", [view, largest])])
+        upper = self._each("sub", [self._each("add", [grown, grid]), grid])
+        lower = self._each("add", [self._each("sub", [grown, upper]), rest])
+        sums = [self._together("sum", part, axes) for part in (upper, lower)]
+        return [self._each("quotient", [grown, rest, *sums])]
 
     def _identity(self, node: onnx.NodeProto, args: list[View], given: dict[str, Any]) -> list[View]:
         return args

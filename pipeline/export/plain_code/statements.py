@@ -31,6 +31,7 @@ ELEMENTWISE: Final[Mapping[str, int]] = {
     "add": 2, "sub": 2, "mul": 2, "div": 2, "min": 2, "max": 2,
     "less": 2, "less_equal": 2, "greater": 2, "greater_equal": 2, "equal": 2, "and": 2, "or": 2,
     "where": 3, "clip": 3,
+    "difference_rest": 2, "exp_rest": 2, "quotient": 4,  # of numbers in two parts, see ``elementary``
 }  # fmt: skip
 # Operations that put together what the summed loops run through. ``dot`` sums products; its third argument, if any, and
 # the second of ``sum`` are added to the finished sum, and stand still in the summed loops.

@@ -1,4 +1,4 @@
-"""Prints exp, log and tanh as FUNCTIONs, from the Python text of ``elementary``, operation by operation."""
+"""Prints the functions of ``elementary`` as FUNCTIONs, from their Python text, operation by operation."""
 
 from __future__ import annotations
 
@@ -19,12 +19,17 @@ _KINDS = {"float": "LREAL", "int": "DINT"}
 
 
 def function_name(name: str, function: str) -> str:
-    """Name of the FUNCTION that stands for ``plain_exp``, ``plain_log`` or ``plain_tanh``."""
+    """Name of the FUNCTION that stands for ``plain_exp`` or another function of ``elementary``."""
     return f"{name}_{function.removeprefix('plain_')}"
 
 
+def parameters(function: str, module: ModuleType = elementary) -> list[str]:
+    """The names of its arguments in the text."""
+    return [local(name) for name in inspect.signature(getattr(module, function)).parameters]
+
+
 def printed_function(name: str, function: str, module: ModuleType = elementary) -> str:
-    """The FUNCTION of ``elementary.function`` for the controller ``name``; its argument is ``xx``."""
+    """The FUNCTION of ``elementary.function`` for the controller ``name``."""
     tree = ast.parse(inspect.getsource(getattr(module, function))).body[0]
     assert isinstance(tree, ast.FunctionDef)
     printer = _InText(module, function_name(name, function))
@@ -33,7 +38,7 @@ def printed_function(name: str, function: str, module: ModuleType = elementary) 
         body.pop()
     variables = [f"    {local(n)} : {kind};" for n, kind in printer.variables.items()]
     constants = [f"    {constant(n)} : {_constant(getattr(module, n))};" for n in printer.constants]
-    given = [f"    {local(a.arg)} : LREAL;" for a in tree.args.args]
+    given = [f"    {a} : LREAL;" for a in parameters(function, module)]
     return "\n".join(
         [
             f"(* {ast.get_docstring(tree)} *)",

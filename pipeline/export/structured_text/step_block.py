@@ -17,7 +17,7 @@ from loopwright.pipeline.export.plain_code.layout import (
 from loopwright.pipeline.export.plain_code.memory import WORK
 from loopwright.pipeline.export.plain_code.rounds import Block, depth
 from loopwright.pipeline.export.plain_code.statements import Place, PlainProgram, PlainStatement
-from loopwright.pipeline.export.structured_text.elementary_functions import function_name
+from loopwright.pipeline.export.structured_text.elementary_functions import function_name, parameters
 from loopwright.pipeline.export.structured_text.iec_names import array_of, typed
 
 _COMPARED = {"less": "<", "less_equal": "<=", "greater": ">", "greater_equal": ">=", "equal": "="}
@@ -130,7 +130,9 @@ class _Printer:
         if op in INFIX:
             yield f"{target} := {args[0]} {INFIX[op]} {args[1]};"
         elif op in OWN:
-            yield f"{target} := {function_name(self.name, OWN[op])}(xx := {args[0]});"
+            given = zip(parameters(OWN[op]), args, strict=True)
+            named = ", ".join(f"{parameter} := {arg}" for parameter, arg in given)
+            yield f"{target} := {function_name(self.name, OWN[op])}({named});"
         elif op in ("copy", "neg", "sqrt"):
             value = {"copy": args[0], "neg": f"-{args[0]}", "sqrt": f"SQRT({args[0]})"}[op]
             yield f"{target} := {value};"

@@ -1,4 +1,4 @@
-"""exp, log and tanh of the plain programs: within one unit of the last place, ends and signs as stated."""
+"""exp, log, tanh and softmax of the plain programs: within one unit of the last place, ends and signs as stated."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from mpmath import mp
+from onnx_graphs import graph
 
 from loopwright.pipeline.export.plain_code.elementary import (
     HIGH_TANH,
@@ -20,6 +21,8 @@ from loopwright.pipeline.export.plain_code.elementary import (
     plain_log,
     plain_tanh,
 )
+from loopwright.pipeline.export.plain_code.interpreter import run
+from loopwright.pipeline.export.plain_code.lowering import lowered
 
 RNG = np.random.default_rng(0)
 N = 3_000  # the benchmark of plain programs takes 10^6
@@ -63,3 +66,38 @@ def test_tanh_is_odd_and_rises_where_its_formula_changes() -> None:
     found = [plain_tanh(v) for v in x.tolist()]
     assert found == [-plain_tanh(-v) for v in x.tolist()]
     assert min(np.diff(found)) >= -math.ulp(found[0])
+
+
+def softmax(x: np.ndarray, axis: int) -> np.ndarray:
+    """By the statements that a graph of it becomes."""
+    nodes = [("Reshape", ["x", np.array(x.shape)], ["xx"]), ("Softmax", ["xx"], ["y"], {"axis": axis})]
+    program = lowered(graph(nodes, {"y": x.shape}, x=(x.size,)))
+    return run(program, x=x.ravel())["out_y"].reshape(x.shape)
+
+
+@pytest.mark.parametrize("spread", [1.0, 30.0, 700.0])
+def test_each_share_of_a_softmax_is_within_one_unit_of_its_last_place(spread: float) -> None:
+    x = RNG.uniform(-spread, spread, (600, 5))
+    x[::7, 3] = x[::7, 1]  # equal ones
+    found, worst = softmax(x, axis=1), 0.0
+    with mp.workprec(140):
+        for row, shares in zip(x.tolist(), found.tolist(), strict=True):
+            grown = [mp.exp(mp.mpf(v)) for v in row]
+            for share, part in zip(shares, grown, strict=True):
+                true = part / mp.fsum(grown)
+                if true > 1e-290:
+                    worst = max(worst, float(abs(mp.mpf(share) - true) / math.ulp(float(true))))
+    assert 0.3 < worst < 0.75
+
+
+def test_a_softmax_goes_along_any_axis_and_says_where_a_number_is_none() -> None:
+    x = RNG.uniform(-3, 3, (2, 3, 4))
+    for axis in range(3):
+        usual = np.exp(x) / np.exp(x).sum(axis, keepdims=True)
+        np.testing.assert_allclose(softmax(x, axis), usual, rtol=1e-15)
+    x[0, 1, 2] = math.nan
+    missing = np.isnan(softmax(x, axis=2))
+    assert missing[0, 1].all()
+    assert missing.sum() == 4
+    assert softmax(np.array([[1e300, -1e300, 0.0]]), axis=1).tolist() == [[1.0, 0.0, 0.0]]
+    assert softmax(np.full((1, 4), 7.0), axis=1).tolist() == [[0.25] * 4]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
 from pathlib import Path
@@ -20,6 +21,7 @@ from loopwright.pipeline.export.gate import export
 from loopwright.pipeline.export.plain_code import elementary
 from loopwright.pipeline.export.plain_code.c_text import printed_step
 from loopwright.pipeline.export.plain_code.interpreter import run_statement
+from loopwright.pipeline.export.plain_code.layout import OWN
 from loopwright.pipeline.export.plain_code.lowering import lowered
 from loopwright.pipeline.export.plain_code.self_test import kit_in_c
 from loopwright.pipeline.export.structured_text.elementary_functions import printed_function
@@ -106,16 +108,17 @@ def test_the_state_stays_in_the_block() -> None:
     assert (step.state, step.mv) == gone_on
 
 
-@pytest.mark.parametrize("function", ["plain_exp", "plain_log", "plain_tanh"])
+@pytest.mark.parametrize("function", OWN.values())
 def test_functions_have_the_bits_of_their_python_text(function: str) -> None:
     text = printed_function("tank", function)
     printed = Machine(text).function(f"tank_{function.removeprefix('plain_')}")
     rng = np.random.default_rng(0)
     points = [*rng.uniform(-1, 1, 300), *rng.uniform(-25, 25, 300), *rng.uniform(-746, 710, 300), 0.0, 5e-324, 1e300]
+    of = getattr(elementary, function)
+    others = rng.uniform(0.5, 2.0, len(inspect.signature(of).parameters) - 1).tolist()
     for x in map(float, points):
-        ours, theirs = getattr(elementary, function)(x), printed(x)
-        assert ours.hex() == theirs.hex(), x
-    assert math.isnan(printed(math.nan)) == math.isnan(getattr(elementary, function)(math.nan))
+        assert of(x, *others).hex() == printed(x, *others).hex(), x
+    assert math.isnan(printed(math.nan, *others)) == math.isnan(of(math.nan, *others))
 
 
 def test_what_compilers_do_differently_is_refused() -> None:
