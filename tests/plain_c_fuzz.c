@@ -49,10 +49,21 @@ static double about(double low, double high, double oddness)
 static double plant[CAP_N_MV];
 static double told[CAP_N_MV];
 
-static long wrong, written, held;
+/* Where an operator last sent the MVs. It is where they stand, too, in a scan that reads nothing back while it is not
+   known where they are, if none ever did or the sample is good: that one jump is the operator's. */
+static double sent[CAP_N_MV];
 
-static void looked_at(const LAW_loop *l, int writes, long scan)
+/* Since the start: whether the plant reads its MVs back, whether it ever did, and how many more scans belong to it: in
+   those a plant is read badly, and operators act, as often as not. */
+static int reads = 1;
+static int has_read;
+static long start;
+
+static long wrong, written, held, blind;
+
+static void looked_at(const LAW_loop *l, int writes, int may_jump, long scan)
 {
+    int jumps = 0;
     for (int k = 0; k < CAP_N_MV && writes; ++k) {
         const double size = fabs(CAP_MV_LOW[k]) > fabs(CAP_MV_HIGH[k]) ? fabs(CAP_MV_LOW[k]) : fabs(CAP_MV_HIGH[k]);
         const double most = CAP_MV_MAX_MOVE[k] + 2e-9 * size;
@@ -60,11 +71,14 @@ static void looked_at(const LAW_loop *l, int writes, long scan)
         const double from_plant = fabs(l->mv[k] - plant[k]);
         const double from_told = fabs(l->mv[k] - told[k]);
         const int slow = !(CAP_MV_MAX_MOVE[k] > 0.0) || from_plant <= most || from_told <= most;
-        if (!inside || !slow) {
+        const int said = may_jump && l->mv[k] >= sent[k] && l->mv[k] <= sent[k];
+        jumps = jumps || !slow;
+        if (!inside || !(slow || said)) {
             printf("scan %ld: MV %d goes from %.17g to %.17g\n", scan, k, plant[k], l->mv[k]);
             ++wrong;
         }
     }
+    blind += jumps;
 }
 
 static void asked(LAW_loop *l)
@@ -77,12 +91,14 @@ static void asked(LAW_loop *l)
         }
         (void)LAW_set_sp(l, sp);
     }
-    if (one_in(10.0)) {
+    if (one_in(start > 0 ? 2.0 : 10.0)) {
         for (int k = 0; k < CAP_N_MV; ++k) {
             mv[k] = about(CAP_MV_LOW[k], CAP_MV_HIGH[k], 10.0);
         }
-        if (l->known) { /* a first MV by hand is where the operator says the actuator stands */
-            (void)LAW_set_mv(l, mv);
+        if (LAW_set_mv(l, mv)) {
+            for (int k = 0; k < CAP_N_MV; ++k) {
+                sent[k] = mv[k];
+            }
         }
     }
     if (one_in(40.0)) {
@@ -167,6 +183,16 @@ int main(int argc, char **argv)
     }
     for (long scan = 0; scan < scans; ++scan) {
         int writes;
+        int known;
+        if (one_in(500.0)) { /* started again, which forgets where the MVs are */
+            LAW_begin(&l, one_in(2.0) ? CAP_MANUAL : CAP_AUTO, 3);
+            reads = !one_in(4.0);
+            has_read = 0;
+            start = (long)(20.0 * drawn());
+            for (int k = 0; k < CAP_N_MV; ++k) {
+                told[k] = sent[k] = plant[k];
+            }
+        }
         asked(&l);
         for (int k = 0; k < CAP_N_PV; ++k) {
             s.pv[k] = about(CAP_PV_LOW[k], CAP_PV_HIGH[k], 30.0);
@@ -175,17 +201,24 @@ int main(int argc, char **argv)
         for (int k = 0; k < CAP_N_DV; ++k) {
             s.dv[k] = about(dv_low[k], dv_high[k], 60.0);
         }
-        s.has_mv_applied = !one_in(3.0);
+        s.has_mv_applied = reads && !one_in(3.0);
         for (int k = 0; k < CAP_N_MV; ++k) {
             const double beyond = 0.02 * (CAP_MV_HIGH[k] - CAP_MV_LOW[k]); /* what scaling may add */
-            s.mv_applied[k] = one_in(100.0) ? about(CAP_MV_LOW[k], CAP_MV_HIGH[k], 2.0) : plant[k];
+            s.mv_applied[k] = one_in(start > 0 ? 2.0 : 100.0) ? about(CAP_MV_LOW[k], CAP_MV_HIGH[k], 2.0) : plant[k];
             if (s.has_mv_applied && s.mv_applied[k] >= CAP_MV_LOW[k] - beyond && s.mv_applied[k] <= CAP_MV_HIGH[k] + beyond) {
                 plant[k] = fmin(fmax(s.mv_applied[k], CAP_MV_LOW[k]), CAP_MV_HIGH[k]); /* somebody else moved it */
             }
         }
         s.age_s = one_in(50.0) ? about(-1.0, 3.0 * CAP_PERIOD_S, 3.0) : 0.0;
-        writes = LAW_scan(&l, one_in(60.0) ? 0 : &s);
-        looked_at(&l, writes, scan);
+        known = l.known;
+        {
+            const int read = !one_in(start > 0 ? 3.0 : 60.0);
+            const int back = read && s.has_mv_applied;
+            writes = LAW_scan(&l, read ? &s : 0);
+            looked_at(&l, writes, !known && !back && (!has_read || l.why == CAP_NONE), scan);
+            has_read = has_read || back;
+            start -= start > 0;
+        }
         for (int k = 0; k < CAP_N_MV && l.mode == CAP_SHADOW; ++k) {
             const int follows = l.why != CAP_NONE || !s.has_mv_applied || (l.mv[k] >= plant[k] && l.mv[k] <= plant[k]);
             if (writes || !follows) {
@@ -206,6 +239,6 @@ int main(int argc, char **argv)
             told[k] = l.mv[k];
         }
     }
-    printf("%ld scans, %ld written, %ld held, %ld wrong\n", scans, written, held, wrong);
+    printf("%ld jumps by hand from nowhere known\n%ld scans, %ld written, %ld held, %ld wrong\n", blind, scans, written, held, wrong);
     return wrong > 0;
 }

@@ -64,6 +64,12 @@ def histories(program: Path, scans: int, seed: int, *words: str) -> tuple[dict[s
     return {name: int(count) for count, name in last[-4:]}, done.stdout + done.stderr
 
 
+def jumps(said: str) -> int:
+    """How often in a run an operator said where MVs stood that nobody knew of."""
+    found = re.search(r"(\d+) jumps", said)
+    return int(found[1]) if found else 0
+
+
 def by_intervals(file: Path, folder: Path) -> tuple[int, int, str]:
     """How many assertions of ``plain_c_intervals.c`` Frama-C proves for ``file``, how many not, and its report."""
     name, header = _folder(file, folder, INTERVALS)

@@ -19,11 +19,13 @@ import pytest
 from kits import (
     DAMAGES,
     EMBED,
+    KEEP_STATE,
     PID,
     ROOT,
     SOME,
     answers_refusals_and_disturbances,
     fails_on_a_damaged_kit,
+    goes_through_random_scans,
     kit_of,
     name,
     refuses_an_old_kit,
@@ -91,6 +93,11 @@ def test_c_gives_the_bits_of_our_runtime(host: Path, file: Path, tmp_path: Path)
     verdict = verdict_on(file, tmp_path / "answers.json")
     assert verdict.identical, verdict.text()
     assert verdict.one_step.rows > 300
+
+
+@pytest.mark.parametrize("file", KEEP_STATE, ids=name)
+def test_random_histories_go_in_c_as_in_our_runtime(host: Path, file: Path, tmp_path: Path) -> None:
+    goes_through_random_scans(partial(run, host), file, tmp_path)
 
 
 def test_c_refuses_results_and_takes_measured_disturbances(host: Path, disobedient_file: Path, tmp_path: Path) -> None:

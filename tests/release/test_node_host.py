@@ -16,10 +16,12 @@ import pytest
 from kits import (
     DAMAGES,
     EMBED,
+    KEEP_STATE,
     PID,
     SOME,
     answers_refusals_and_disturbances,
     fails_on_a_damaged_kit,
+    goes_through_random_scans,
     kit_of,
     name,
     refuses_an_old_kit,
@@ -78,6 +80,11 @@ def test_node_gives_the_bits_of_our_runtime(file: Path, conformed: dict[Path, tu
     verdict = verdict_on(file, answers)
     assert verdict.identical, verdict.text()
     assert verdict.one_step.rows > 300
+
+
+@pytest.mark.parametrize("file", KEEP_STATE, ids=name)
+def test_random_histories_go_in_node_as_in_our_runtime(file: Path, tmp_path: Path) -> None:
+    goes_through_random_scans(run, file, tmp_path)
 
 
 def test_node_refuses_results_and_takes_measured_disturbances(disobedient_file: Path, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from kits import CASES
 from operated_law import ENTRIES, FASTEST, PLANT, OperatedLaw
-from plain_c_fuzz import by_intervals, fuzzer, histories
+from plain_c_fuzz import by_intervals, fuzzer, histories, jumps
 
 from loopwright.pipeline.export.gate import export
 
@@ -41,6 +41,7 @@ def test_random_histories_of_a_law_that_operators_steer(steered: Path, tmp_path:
     assert counts, said
     assert counts["wrong"] == 0, said
     assert counts["written"] > counts["held"] > SCANS // 50
+    assert jumps(said) > 0
 
 
 @pytest.mark.parametrize(
@@ -48,11 +49,12 @@ def test_random_histories_of_a_law_that_operators_steer(steered: Path, tmp_path:
     [
         ("size_of(way) > most)", "size_of(way) > 9.0 * most)"),  # an MV by hand as fast as it likes
         ("if (!mv_may_be(k, mv[k], 0.0))", "if (!mv_may_be(k, mv[k], 0.5))"),  # an MV by hand beyond its range
+        ("(good_one || !l->is_read);", "1;"),  # an MV by hand that jumps after a read-back that was bad
         ("if (!placed(l) || ", "if (!placed(l) || 0 * (int)"),  # what others command is not followed
     ],
 )
 def test_a_guard_without_a_check_is_found(steered: Path, tmp_path: Path, old: str, new: str) -> None:
-    counts, _ = histories(fuzzer(steered, tmp_path / "c", "-O1", old, new), SCANS, seed=3)
+    counts, _ = histories(fuzzer(steered, tmp_path / "c", "-O1", old, new), 10 * SCANS, seed=3)
     assert counts["wrong"] > 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 import onnx
 import pytest
 from identified_models import random_model
-from kits import CASES, name
+from kits import CASES, KEEP_STATE, name
 from predictive_loops import law_of
+from random_scans import random_rows
 from structured_text.machine import Machine
 
 from loopwright.pipeline.export.gate import export
@@ -25,6 +27,7 @@ from loopwright.serving.conformance.kit import CHAIN_TOLERANCE
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.modes import Mode
 
+HISTORIES, SCANS = 2, 200
 FILES = [min(case.glob("*.onnx")) for case in CASES]
 
 
@@ -85,6 +88,14 @@ def test_scans_go_as_the_kit_says(file: Path) -> None:
     machine, m, kit = machine_of(file)
     assert len(kit.scans) > 100
     assert wrong_scans(machine, m, kit) == []
+
+
+@pytest.mark.parametrize("file", KEEP_STATE, ids=name)
+def test_random_histories_go_as_in_our_runtime(file: Path) -> None:
+    machine, m, kit = machine_of(file)
+    for seed in range(HISTORIES):
+        rows = random_rows(Controller(file), seed, SCANS)
+        assert wrong_scans(machine, m, replace(kit, scans=rows)) == [], f"history {seed}"
 
 
 @pytest.fixture(scope="module")
