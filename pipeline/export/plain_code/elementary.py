@@ -7,9 +7,9 @@ contraction. Each result is within one unit of its last place (``benchmarks/last
 large for a double is ``LARGEST``, with its sign. A softmax is as exact since its exponents, their exponentials and the
 sum of these are kept in two parts: a double, and what it lacks, the rest.
 
-Source: reduction and reconstruction as in Muller, Elementary Functions, 3rd ed., chapters 5 and 11; sums and products in
-two parts as in Dekker, Numerische Mathematik 18, 1971. The coefficients are interpolants at Chebyshev nodes, made with
-60 digits.
+Source: reduction and reconstruction as in Muller, Elementary Functions, 3rd ed., chapters 5 and 11; sums and products
+in two parts as in Dekker, Numerische Mathematik 18, 1971. The coefficients are interpolants at Chebyshev nodes, made
+with 60 digits.
 """
 
 from __future__ import annotations

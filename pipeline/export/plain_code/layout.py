@@ -14,9 +14,7 @@ WIDTH = 100  # characters of a line of numbers
 COUNTERS, ROUND_COUNTERS = "ijklmn", "rqp"  # of loops and of rounds, outer ones first
 EXTREMES: Mapping[str, str] = {"largest": "max", "least": "min"}
 # Operations that are functions of ``elementary``.
-OWN: Mapping[str, str] = {
-    op: f"plain_{op}" for op in ("exp", "log", "tanh", "difference_rest", "exp_rest", "quotient")
-}
+OWN: Mapping[str, str] = {op: f"plain_{op}" for op in ("exp", "log", "tanh", "difference_rest", "exp_rest", "quotient")}
 INFIX: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
 

@@ -131,8 +131,8 @@ class _Printer:
             yield f"{target} := {args[0]} {INFIX[op]} {args[1]};"
         elif op in OWN:
             given = zip(parameters(OWN[op]), args, strict=True)
-            named = ", ".join(f"{parameter} := {arg}" for parameter, arg in given)
-            yield f"{target} := {function_name(self.name, OWN[op])}({named});"
+            words = ", ".join(f"{parameter} := {arg}" for parameter, arg in given)
+            yield f"{target} := {function_name(self.name, OWN[op])}({words});"
         elif op in ("copy", "neg", "sqrt"):
             value = {"copy": args[0], "neg": f"-{args[0]}", "sqrt": f"SQRT({args[0]})"}[op]
             yield f"{target} := {value};"
