@@ -16,8 +16,8 @@ from loopwright.pipeline.simulation.scenario import Scenario
 LAST_RANK = 4.0  # of a PV for which the law has no rank: its range is out of use
 
 
-def asked_at(course: OperatedCourse, plant: Simulator, stands: Array | None = None) -> RestWishes:
-    """The wishes at the end of a course.
+def asked_at(course: OperatedCourse, plant: Simulator, stands: Array | None = None, sample: int = -1) -> RestWishes:
+    """The wishes at a sample of a course, by default its last.
 
     An MV out of use stays where it ``stands`` (n_mv,), or at the MVs of the plant's start. A PV without entries is out
     of use.
@@ -26,7 +26,7 @@ def asked_at(course: OperatedCourse, plant: Simulator, stands: Array | None = No
     stay = plant.start[1] if stands is None else stands
 
     def of(signals: tuple[str, ...], what: str, default: list[float]) -> Array:
-        return np.array([course.at(name, what, of) for name, of in zip(signals, default, strict=True)])
+        return np.array([course.at(name, what, of, sample) for name, of in zip(signals, default, strict=True)])
 
     pv_names, mv_names = tuple(s.name for s in pvs), tuple(s.name for s in mvs)
     nothing, none = [0.0] * len(pvs), [0.0] * len(mvs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -11,6 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT, OperatingRange, visited_mv
+from loopwright.pipeline.cases.operator_asks import asked_at, problem_of
 from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_ARRAYS, MODEL_SET, Doubts, OwnPlant, doubted, suits
 from loopwright.pipeline.config.exports import is_exported
 from loopwright.pipeline.errors import ModelError, PlantError, RecordError
@@ -19,11 +20,15 @@ from loopwright.pipeline.evaluation.evidence_basis import RecordVerdict
 from loopwright.pipeline.evaluation.model_evidence import Metrics, identified_part
 from loopwright.pipeline.evaluation.one_side import before_turns, on_one_side
 from loopwright.pipeline.files import read_json
+from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.records.record_file import RecordedSetPoints
 from loopwright.pipeline.records.recorded_rests import RecordedRest, rests_of
+from loopwright.pipeline.simulation.operator_changes import OperatedCourse
 from loopwright.pipeline.simulation.rests import answered
+from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.serving.manifest import OperateEntry
 
 MEMBERS = "plant*.npz"  # further models, in whose place no law is tuned
 CURVE_MV_VALUES = 101  # values of an MV over its range at which the models' turns are sought: 1 % apart
@@ -70,6 +75,17 @@ class OwnEnsemble(Case):
     def _model(self) -> OwnPlant:
         """The law's own model, begun at the median MVs that laws may command."""
         return self._member(self._law_file, visited_mv(self.record, self.commanded.mv)[1])
+
+    def rest_within_ranges(self, test: Scenario, entries: Sequence[OperateEntry], row: int, mv: Array) -> Array | None:
+        """By the model of the test: ranges first, by their ranks, then set points; see ``RestProblem``."""
+        plant = test.plant or self.plant
+        if not entries or not isinstance(plant, IdentifiedPlant):
+            return None
+        course = OperatedCourse.of(entries, test.operate, test.samples, f"test {test.name!r}")
+        p, dv = test.parameters(plant)[row], test.disturbances(plant)[row]
+        asked = asked_at(course, plant, mv, row)
+        best = problem_of(plant).best(asked, test.sp[row], p, dv, (test.x0, test.mv0))
+        return None if best is None else best.y[: test.sp.shape[1]]
 
     @cached_property
     def members(self) -> tuple[OwnPlant, ...]:

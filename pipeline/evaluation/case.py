@@ -25,6 +25,7 @@ from loopwright.pipeline.plants.simulator import Signals, Simulator
 from loopwright.pipeline.records.record import Record
 from loopwright.pipeline.records.recorded_rests import RecordedRest
 from loopwright.pipeline.simulation.scenario import Scenario
+from loopwright.serving.manifest import OperateEntry
 
 Array = NDArray[np.float64]
 Setting = Mapping[str, float | str]
@@ -216,6 +217,13 @@ class Case(ABC):
     def asked(self) -> Array:
         """How far set points go from one to another, (n_cv,): the ranges, or less where a case states it."""
         return np.array([s.high - s.low for s in self.plant.sp_signals])
+
+    def rest_within_ranges(self, test: Scenario, entries: Sequence[OperateEntry], row: int, mv: Array) -> Array | None:
+        """Where the CVs (n_cv,) rest at best at a row of a test, for a law that keeps the ranges of its ``entries``.
+
+        ``mv`` (n_mv,) are the MVs then. None where no model says so.
+        """
+        return None
 
     @property
     def spans(self) -> Array:

@@ -133,13 +133,6 @@ def lock_ups(
     return found
 
 
-def locked_up(
-    sp: ArrayLike, pv: ArrayLike, mv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike, span: ArrayLike
-) -> bool:
-    """Whether the loop locks up in some hold, as ``lock_ups`` finds them."""
-    return bool(lock_ups(sp, pv, mv, hold, low=low, high=high, span=span))
-
-
 def left_limits(pv: ArrayLike, hold: int, *, low: ArrayLike, high: ArrayLike) -> bool:
     """Whether a CV is beyond its range [low, high] (n_cv,) by more than ``LEFT`` of it in the second half of a hold.
 

@@ -16,12 +16,11 @@ import numpy as np
 
 from loopwright.pipeline.engine.parallel import parallel_map
 from loopwright.pipeline.evaluation.case import Array, Case
-from loopwright.pipeline.evaluation.closed_loop import STEP_BAND, last_half, left_limits, lock_ups, swings
+from loopwright.pipeline.evaluation.closed_loop import STEP_BAND, last_half, swings
 from loopwright.pipeline.evaluation.extrapolation import reached_by, widest
-from loopwright.pipeline.evaluation.knowing_control import reached
 from loopwright.pipeline.evaluation.law_evidence import BASE, Cycle
 from loopwright.pipeline.evaluation.metric import DRAW_SEEDS, TRAVEL, mean_of_draws, together
-from loopwright.pipeline.plants.identified import IdentifiedPlant
+from loopwright.pipeline.evaluation.stuck_loops import seized, swings_on
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.scenario import NOISE_SUFFIX, Scenario
 from loopwright.pipeline.simulation.simulate import (
@@ -99,7 +98,7 @@ class Trial:
     development_travel: float  # of the MVs over these, their mean; nan without any
     locked_up: dict[str, int]  # test -> closed loops that locked up, of those where any did; DEVELOPED: development
     swings: dict[str, int]  # the same of closed loops that swing to the end
-    beyond_reach: dict[str, int]  # test -> holds that count as no lock-up, because no control gets to the set point
+    beyond_reach: dict[str, int]  # test -> holds that count as no lock-up: no control gets there
     curves: dict[str, Trajectory]
     reached: dict[str, tuple[float, float]]  # without noise, models gone wrong apart, PVs and MVs; of a case on models
     cycles: dict[str, Cycle]  # test -> its worst limit cycle, without noise; of a case on models alone
@@ -142,7 +141,7 @@ def repeated(controller: Controller, case: Case, test: Scenario, noise: bool, se
         for i in draws
     ]
     rows = [case.score(test, loop.pv, loop.mv) for loop in loops]
-    found = [seized(case, test, loop) for loop in loops]
+    found = [seized(case, test, loop, controller.manifest.operate) for loop in loops]
     swing = sum(swings_on(case, test, loop) for loop in loops)
     cycle = cycle_of(case, test, loops[0]) if case.on_models and not noise and not test.replayed else None
     return Repeated(
@@ -192,38 +191,6 @@ def close_loop(
         return mv, (*info.tolist(), 0.0)
 
     return simulate_closed(plant, step, test, noise=noise, seed=seed, every=every)
-
-
-def seized(case: Case, test: Scenario, loop: Trajectory) -> tuple[bool, int]:
-    """(whether the loop locked up, holds in which it is at an end because its set point is beyond reach).
-
-    It locks up at an end of an MV, or where the controller refused a step: one refuses to give an MV beyond its range.
-    Where the tests run on models, a CV far beyond its range counts too: equations hold far from where they were meant,
-    a model of a record does not.
-
-    On a model of a record a hold counts only where a control that knows the model comes near the set point within the
-    hold, from the same state: a plant gone wrong may not get there at all.
-    """
-    n = test.sp.shape[1]
-    # As many MVs as set points; a further one may have a part that rests at an end.
-    mvs = case.plant.mv_signals[:n]
-    limits = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
-    jammed = lock_ups(loop.sp, loop.pv[:, :n], loop.mv[:, :n], test.hold, **limits, span=case.asked)
-    plant, beyond = test.plant or case.plant, list[slice]()
-    if case.on_models and isinstance(plant, IdentifiedPlant):
-        before = np.vstack([test.mv0, loop.mv])  # the MVs at the beginning of each sample
-        best = (reached(plant, test, of, loop.x[of.start], before[of.start], case.asked) for of in jammed)
-        beyond = [of for of, found in zip(jammed, best, strict=True) if not found.near]
-    ends = {end: [getattr(s, end) for s in case.plant.sp_signals] for end in ("low", "high")}
-    left = case.on_models and left_limits(loop.pv[:, :n], test.hold, **ends)
-    return len(jammed) > len(beyond) or left or bool(loop.info[:, -1].any()), len(beyond)
-
-
-def swings_on(case: Case, test: Scenario, loop: Trajectory) -> bool:
-    """Whether a controlled variable swings about its set point to the end of the test; a replayed load may swing."""
-    if test.replayed:
-        return False
-    return bool(swings(loop.sp, loop.pv[:, : test.sp.shape[1]], case.spans).any())
 
 
 def step_us(controller: Controller, loop: Trajectory, dv: Array) -> dict[str, float]:

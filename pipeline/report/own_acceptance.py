@@ -102,11 +102,11 @@ def against(evidence: Evidence) -> list[dict[str, str]]:
 
 
 def beyond_reach(evidence: Evidence) -> list[str]:
-    """A sentence for each shipped law that had holds whose set point no control gets to, which are no lock-ups."""
+    """A sentence for each shipped law that had holds whose set point nothing gets to, which are no lock-ups."""
     found = {law: evidence.laws[law].metrics.beyond_reach for law in shipped_laws(evidence)}
     return [
         f"Holds of {law} at an end of the MVs count as no lock-up in {lock_up_text(tests)}: "
-        "no control gets to their set point in time."
+        "no control gets to their set point in time, or none that keeps the ranges."
         for law, tests in found.items()
         if tests
     ]

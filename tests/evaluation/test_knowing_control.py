@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,9 +15,11 @@ from loopwright.pipeline.cases import own_plant
 from loopwright.pipeline.cases.own_model import SLOW, GoneWrong
 from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.evaluation.knowing_control import gets_there, reached
-from loopwright.pipeline.evaluation.trials import close_loop, repeated, seized
+from loopwright.pipeline.evaluation.stuck_loops import seized
+from loopwright.pipeline.evaluation.trials import close_loop, repeated
 from loopwright.pipeline.plants.identified import IdentifiedPlant
 from loopwright.pipeline.simulation.scenario import Scenario, held
+from loopwright.serving.manifest import OperateEntry
 
 HOLD = 40
 
@@ -108,6 +111,35 @@ def test_a_hold_beyond_reach_is_no_lock_up_and_is_counted() -> None:
     assert seized(case, quick, close_loop(controller, case.plant, quick, None, 0)) == (True, 0)
     both = a_test(case, [2.5, -1.9])
     assert seized(case, both, close_loop(controller, case.plant, both, None, 0)) == (True, 1)
+
+
+def ranged(high: float) -> tuple[OperateEntry, ...]:
+    """What a law has of ``operate`` that follows the lag's set point within a range up to ``high``."""
+    values = {"use": 1.0, "track": 1.0, "rank": 1.0, "low": -3.0, "high": high}
+    ends = {"use": (0.0, 1.0), "track": (0.0, 1.0), "rank": (1.0, 4.0)}
+    return tuple(
+        OperateEntry("cv", "y0", what, "", value, *ends.get(what, (-3.0, 3.0)))  # type: ignore[arg-type]
+        for what, value in values.items()
+    )
+
+
+def test_the_best_rest_keeps_ranges_before_set_points() -> None:
+    case = controllers_of_a_lag({})
+    test, mv = a_test(case, [1.0, 1.5]), np.zeros(1)
+    assert case.rest_within_ranges(test, (), 10, mv) is None
+    for high, row, best in ((0.5, 10, 0.5), (1.2, 10, 1.0), (1.2, HOLD + 10, 1.2), (3.0, HOLD + 10, 1.5)):
+        found = case.rest_within_ranges(test, ranged(high), row, mv)
+        assert found == pytest.approx([best], abs=1e-4)
+
+
+@pytest.mark.parametrize(("best", "stuck"), [(2.0, False), (1.2, True), (1.49, True)])
+def test_a_loop_at_the_best_rest_within_ranges_is_not_stuck_and_another_is(best: float, stuck: bool) -> None:
+    """An MV at its end, the CV at 2 and its set point at 1.5: as it must be where ranges ask for it, and only there."""
+    case, controller = controllers_of_a_lag({}), AtEnd(1.0)
+    test = a_test(case, [1.5])
+    loop = close_loop(controller, case.plant, test, None, 0)  # type: ignore[arg-type]
+    with mock.patch.object(type(case), "rest_within_ranges", return_value=np.array([best])):
+        assert seized(case, test, loop, ranged(3.0)) == (stuck, int(not stuck))
 
 
 def test_where_tests_run_on_equations_every_such_hold_counts(monkeypatch: pytest.MonkeyPatch) -> None:

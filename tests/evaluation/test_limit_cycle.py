@@ -13,7 +13,8 @@ from own_cases import controllers_of_a_lag
 from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.evaluation.closed_loop import RANGE_BAND, STEP_BAND
 from loopwright.pipeline.evaluation.law_evidence import Cycle
-from loopwright.pipeline.evaluation.trials import MV_SWING, NOISES, cycle_of, swings_on
+from loopwright.pipeline.evaluation.stuck_loops import swings_on
+from loopwright.pipeline.evaluation.trials import MV_SWING, NOISES, cycle_of
 from loopwright.pipeline.simulation.simulate import Trajectory, simulate_closed
 
 PERIOD = 8  # samples of a swing

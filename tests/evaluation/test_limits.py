@@ -14,7 +14,8 @@ from own_cases import filled_level
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.cases.own_plant import OwnCase
 from loopwright.pipeline.evaluation.closed_loop import LEFT, left_limits, locked_up
-from loopwright.pipeline.evaluation.trials import close_loop, repeated, seized
+from loopwright.pipeline.evaluation.stuck_loops import seized
+from loopwright.pipeline.evaluation.trials import close_loop, repeated
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopwrightError
 

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as npst
 
 from loopwright.pipeline import metrics
 from loopwright.pipeline.evaluation import closed_loop
-from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics, locked_up
+from loopwright.pipeline.evaluation.closed_loop import closed_loop_metrics, lock_ups
 from loopwright.pipeline.evaluation.metric import METRICS
 
 KEYS = {m.name for m in METRICS.values() if m.of} | {"ise", "masse", "max_asse", "overshoot", "settling", "mv_travel"}
@@ -156,20 +156,20 @@ def test_locked_up_needs_saturation_and_error_through_half_a_hold() -> None:
     sp = np.repeat([0.5, 0.9], 40)
     off, full = np.full(80, 0.1), np.full(80, 500.0)
     limits = {"low": 0.0, "high": 500.0, "span": 1.0}
-    assert locked_up(sp, off, full, 40, **limits)
-    assert locked_up(sp, off, 0 * full, 40, **limits)
-    assert not locked_up(sp, sp - 0.01, full, 40, **limits)  # near: an extreme set point may need the limit
-    assert not locked_up(sp, off, 0.9 * full, 40, **limits)
+    assert lock_ups(sp, off, full, 40, **limits)
+    assert lock_ups(sp, off, 0 * full, 40, **limits)
+    assert not lock_ups(sp, sp - 0.01, full, 40, **limits)  # near: an extreme set point may need the limit
+    assert not lock_ups(sp, off, 0.9 * full, 40, **limits)
     late = full.copy()
     late[[35, 75]] = 250.0
-    assert not locked_up(sp, off, late, 40, **limits)
+    assert not lock_ups(sp, off, late, 40, **limits)
 
 
 def test_locked_up_is_far_in_terms_of_the_range() -> None:
     sp, full = np.full(40, 8.0), np.full(40, 1050.0)
     limits = {"low": 850.0, "high": 1050.0, "hold": 0}
-    assert locked_up(sp, sp - 0.06, full, span=2.0, **limits)
-    assert not locked_up(sp, sp - 0.06, full, span=3.5, **limits)
+    assert lock_ups(sp, sp - 0.06, full, span=2.0, **limits)
+    assert not lock_ups(sp, sp - 0.06, full, span=3.5, **limits)
 
 
 def test_a_batch_that_heats_up_is_not_locked_up_and_one_that_never_follows_is() -> None:
@@ -179,8 +179,8 @@ def test_a_batch_that_heats_up_is_not_locked_up_and_one_that_never_follows_is() 
     heating = np.minimum(25 + 0.5 * t, 99.5)
     followed, mv = np.where(t < 180, heating, sp), np.where(t < 180, 1.0, 0.4)
     limits = {"hold": 0, "low": 0.0, "high": 1.0, "span": 110.0}
-    assert not locked_up(sp, followed, mv, **limits)
-    assert locked_up(sp, heating, np.ones(len(t)), **limits)
+    assert not lock_ups(sp, followed, mv, **limits)
+    assert lock_ups(sp, heating, np.ones(len(t)), **limits)
 
 
 def test_fit_and_r2_are_zero_for_the_mean_and_full_for_the_truth() -> None:

@@ -12,7 +12,8 @@ import pytest
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.evaluation import trials
 from loopwright.pipeline.evaluation.case import Case, Curve, Figure
-from loopwright.pipeline.evaluation.trials import DRAW_SEEDS, close_loop, repeated, seized, swings_on, try_files
+from loopwright.pipeline.evaluation.stuck_loops import seized, swings_on
+from loopwright.pipeline.evaluation.trials import DRAW_SEEDS, close_loop, repeated, try_files
 from loopwright.pipeline.plants.simulator import Simulator
 from loopwright.pipeline.simulation.scenario import Scenario
 from loopwright.serving.errors import OutputError

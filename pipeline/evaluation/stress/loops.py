@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.pipeline.evaluation.closed_loop import left_limits, locked_up, swings
+from loopwright.pipeline.evaluation.closed_loop import left_limits, lock_ups, swings
 from loopwright.pipeline.evaluation.stress.draws import Actuators, Draw, Drawing
+from loopwright.pipeline.evaluation.stuck_loops import kept_by_ranges
 from loopwright.pipeline.plants.equations import EquationPlant
 from loopwright.pipeline.plants.identified import IdentifiedPlant, StateEquation
 from loopwright.pipeline.plants.simulator import Array, Simulator
@@ -221,12 +222,15 @@ class Stress:
         spans = [s.high - s.low for s in cvs]
         limits: dict[str, list[float]] = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
         ends: dict[str, list[float]] = {end: [getattr(s, end) for s in cvs] for end in ("low", "high")}
+        jammed = lock_ups(loop.sp, loop.pv[:, :n_cv], loop.mv[:, :n_cv], test.hold, **limits, span=case.asked)
+        asked = dict(self.operate)
+        entries = [replace(e, default=asked.get(e.name, e.default)) for e in self.controller.manifest.operate]
         # A loop that is broken has no figures of worth; as infinite ones they count as worst.
         figures = case.score(test, loop.pv, loop.mv)
         return StressOutcome(
             draw.index,
             dict.fromkeys(figures, float("inf")) if broke else figures,
-            locked_up(loop.sp, loop.pv[:, :n_cv], loop.mv[:, :n_cv], test.hold, **limits, span=case.asked),
+            not all(kept_by_ranges(case, test, loop, entries, of) for of in jammed),
             left_limits(loop.pv[:, :n_cv], test.hold, **ends),
             int(loop.info.sum()),
             broke,
