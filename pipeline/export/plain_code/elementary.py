@@ -74,7 +74,7 @@ def plain_exp(x: float) -> float:
 
 
 def plain_exp_rest(x: float, rest: float) -> float:
-    """What ``plain_exp(x)`` lacks of the exponential of x + rest; 0 where x is no argument of it."""
+    """The rest that ``plain_exp(x)`` lacks of the exponential of x + rest; 0 where x is no argument of it."""
     if x != x:  # NaN
         return 0.0
     if x >= MOST_EXP:
@@ -99,7 +99,7 @@ def plain_exp_rest(x: float, rest: float) -> float:
 
 
 def plain_difference_rest(above: float, below: float) -> float:
-    """What the double above - below lacks of the difference."""
+    """The rest that the double above - below lacks of the difference."""
     d: float = above - below
     back: float = d - above
     return (above - (d - back)) - (below + back)
