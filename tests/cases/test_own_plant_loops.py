@@ -11,7 +11,7 @@ from own_cases import GAINS, POLES, RATE, filled_level, loop_of, section, two_la
 
 from loopwright.pipeline.cases.own_plant import PERCENT, OwnCase, own_case
 from loopwright.pipeline.errors import ParamsError
-from loopwright.pipeline.evaluation.closed_loop import locked_up
+from loopwright.pipeline.evaluation.closed_loop import lock_ups
 from loopwright.pipeline.laws.predictive.predictive import Predictive
 from loopwright.pipeline.models import load_model
 from loopwright.pipeline.simulation.scenario import Scenario
@@ -77,7 +77,7 @@ def test_a_law_for_two_variables_holds_them(two: OwnCase) -> None:
     for name in ("spoilt", "load"):
         test = two.scenarios()[name][0]
         loop = closed(two, test)
-        assert not locked_up(test.sp, loop.pv, loop.mv, test.hold, low=[-1, -1], high=[1, 1], span=[6, 6])
+        assert not lock_ups(test.sp, loop.pv, loop.mv, test.hold, low=[-1, -1], high=[1, 1], span=[6, 6])
         assert np.abs(test.sp - loop.pv)[-5:].max() < 0.02
         assert two.score(test, loop.pv, loop.mv)["mae"] < 4
 
@@ -114,7 +114,7 @@ def test_one_mv_at_its_end_and_one_variable_far_away_are_a_lock_up(
     stuck: tuple[int, int], far: tuple[int, int], said: bool
 ) -> None:
     pv, mv = np.tile(np.array(far, float), (20, 1)), np.tile(np.array(stuck, float), (20, 1))
-    assert locked_up(np.zeros((20, 2)), pv, mv, 0, low=[-1, -1], high=[1, 1], span=[2, 2]) is said
+    assert bool(lock_ups(np.zeros((20, 2)), pv, mv, 0, low=[-1, -1], high=[1, 1], span=[2, 2])) is said
 
 
 def test_a_simulation_moves_the_set_point_that_is_named(two: OwnCase) -> None:

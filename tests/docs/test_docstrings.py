@@ -16,7 +16,9 @@ from words_of_code import JINJA, sources, words_of
 
 BEGINNINGS = r"Of|That|What|As|In which|Which|Whose|Who"
 # A stop with no space behind it is part of a name or number. The mark ends a question.
-BEGUN = re.compile(rf"(?:^|(?<=[.!?:] )|(?<=\n\n))(?:{BEGINNINGS})\b(?:[^.!?\n]|[.!?](?=[^\s.!?]))*+(?!\?)")
+INNER = r"[^.!?\n]|[.!?](?=[^\s.!?])"
+# To its end: Python 3.11.2 takes a possessive *+ wrongly.
+BEGUN = re.compile(rf"(?:^|(?<=[.!?:] )|(?<=\n\n))(?:{BEGINNINGS})\b(?:{INNER})*(?!\?|{INNER})")
 UNREAD = re.compile(r"^(?:\{\{ \")?#.*$|^\|.*\n+(?=\|:?--)|<!--.*?-->", re.MULTILINE)  # headings, heads, remarks
 APART = re.compile(r"\n\s*\n|\n(?=[ \t]*(?:[-*]|\d+\.) )|(?<!\\)\|")  # paragraphs, list items and cells
 # Signs of list items, links and emphasis, which are no words.

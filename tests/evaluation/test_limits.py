@@ -13,7 +13,7 @@ from own_cases import filled_level
 
 from loopwright.pipeline.cases import CASES
 from loopwright.pipeline.cases.own_plant import OwnCase
-from loopwright.pipeline.evaluation.closed_loop import LEFT, left_limits, locked_up
+from loopwright.pipeline.evaluation.closed_loop import LEFT, left_limits, lock_ups
 from loopwright.pipeline.evaluation.stuck_loops import seized
 from loopwright.pipeline.evaluation.trials import close_loop, repeated
 from loopwright.serving.controller import Controller
@@ -71,7 +71,7 @@ def test_the_swinging_loop_is_no_lock_up(level: OwnCase) -> None:
     """Without the check of the limits it would be shipped."""
     test = level.tests()["held_out"][0]
     loop = close_loop(cast(Controller, Told(swinging)), level.plant, test, None, 0)
-    assert not locked_up(loop.sp, loop.pv, loop.mv, test.hold, low=[-1.0], high=[1.0], span=[6.0])
+    assert not lock_ups(loop.sp, loop.pv, loop.mv, test.hold, low=[-1.0], high=[1.0], span=[6.0])
     assert np.abs(loop.pv).max() > 3 + LEFT * 6
     assert seized(level, test, loop)[0]
 
