@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -37,10 +37,13 @@ class OperatingRange:
     whose rests leave the visited range of a CV are drawn nearer to their medians. A CV that never settles (an
     integrator) takes set points drawn over its own visited range, under MVs that balance it; and so do all CVs where
     even the medians' rest leaves the visited range. No set point leaves it: one that no MV was found for is cut to it.
+
+    ``ranges``, PV -> (lowest, highest), are to be kept beside the set points: no rest beyond one of them is drawn.
     """
 
     model: IdentifiedPlant
     record: Record
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @cached_property
     def mv(self) -> Array:
@@ -174,16 +177,25 @@ class OperatingRange:
         """
         scaled = self.mv[1] + np.array(SCALES)[:, None, None] * (draws - self.mv[1])
         x = settled(plant, plant.start[0], scaled.reshape(-1, draws.shape[1]), p)
-        cvs = plant.measured(x).reshape(*scaled.shape[:2], -1)[..., : self.cv.shape[1]]
-        good = inside(cvs, self.cv[0], self.cv[2])
+        pvs = plant.measured(x).reshape(*scaled.shape[:2], -1)
+        cvs = pvs[..., : self.cv.shape[1]]
+        good = inside(cvs, self.cv[0], self.cv[2]) & self._kept(plant, pvs)
         return np.asarray(cvs[good.argmax(axis=0), np.arange(len(draws))]), np.asarray(good.any(axis=0))
+
+    def _kept(self, plant: Simulator, pvs: Array) -> NDArray[np.bool_]:
+        """The rows of a plant's PVs (..., n_pv) that lie within ``ranges``."""
+        ends = [self.ranges.get(s.name, (-np.inf, np.inf)) for s in plant.pv_signals]
+        return inside(pvs, *np.array(ends).T)
 
     def _held(self, plant: Simulator, wanted: Array, p: Array | None) -> Array | None:
         """CVs (n_cv,) of a rest on the way from where the plant starts to ``wanted`` (n_cv,); None without one."""
         start = self._begin(plant)
-        levels = [start + scale * (wanted - start) for scale in SCALES]
-        can = (at for at in levels if held_at(plant, plant.start, at, self.model.mv_signals, p) is not None)
-        return next(can, None)
+        for scale in SCALES:
+            levels = start + scale * (wanted - start)
+            held = held_at(plant, plant.start, levels, self.model.mv_signals, p)
+            if held is not None and self._kept(plant, plant.measure(held[0])):
+                return levels
+        return None
 
     def _balances(
         self, plant: Simulator, draws: Array, rng: np.random.Generator, p: Array | None
@@ -196,9 +208,10 @@ class OperatingRange:
             found[k, which] = levels
             for scale in SCALES:
                 x, mv, away = balanced(plant, start, mv0 + scale * (draw - self.mv[1]), levels, which, p)
-                cvs = plant.measure(x)[: self.cv.shape[1]]
-                visited = inside(cvs[None], self.cv[0], self.cv[2])[0]
-                if away < BALANCED and visited and can_command(self.model.mv_signals, mv):
+                pvs = plant.measure(x)
+                cvs = pvs[: self.cv.shape[1]]
+                good = inside(cvs, self.cv[0], self.cv[2]) & self._kept(plant, pvs)
+                if away < BALANCED and good and can_command(self.model.mv_signals, mv):
                     found[k] = cvs
                     break
             else:

@@ -45,16 +45,16 @@ def asked_at(course: OperatedCourse, plant: Simulator, stands: Array | None = No
     )
 
 
-def best_rest(test: Scenario, course: OperatedCourse, stands: Array) -> BestRest | None:
-    """The best steady state of the test's plant for what is asked at its end; None where no model says one.
+def best_rest(test: Scenario, course: OperatedCourse, stands: Array, sample: int = -1) -> BestRest | None:
+    """The best steady state of the test's plant for what is asked at a sample, its last; None where no model says one.
 
     An MV out of use stays where it ``stands`` (n_mv,).
     """
     plant = test.plant
     if not isinstance(plant, IdentifiedPlant):
         return None
-    asked, p, dv = asked_at(course, plant, stands), test.parameters(plant)[-1], test.disturbances(plant)[-1]
-    return problem_of(plant).best(asked, test.sp[-1], p, dv, (test.x0, test.mv0))
+    asked, p = asked_at(course, plant, stands, sample), test.parameters(plant)[sample]
+    return problem_of(plant).best(asked, test.sp[sample], p, test.disturbances(plant)[sample], (test.x0, test.mv0))
 
 
 def problem_of(plant: IdentifiedPlant) -> RestProblem:

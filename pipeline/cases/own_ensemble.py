@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -11,7 +12,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT, OperatingRange, visited_mv
-from loopwright.pipeline.cases.operator_asks import asked_at, problem_of
+from loopwright.pipeline.cases.operator_asks import best_rest
 from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_ARRAYS, MODEL_SET, Doubts, OwnPlant, doubted, suits
 from loopwright.pipeline.config.exports import is_exported
 from loopwright.pipeline.errors import ModelError, PlantError, RecordError
@@ -82,9 +83,7 @@ class OwnEnsemble(Case):
         if not entries or not isinstance(plant, IdentifiedPlant):
             return None
         course = OperatedCourse.of(entries, test.operate, test.samples, f"test {test.name!r}")
-        p, dv = test.parameters(plant)[row], test.disturbances(plant)[row]
-        asked = asked_at(course, plant, mv, row)
-        best = problem_of(plant).best(asked, test.sp[row], p, dv, (test.x0, test.mv0))
+        best = best_rest(replace(test, plant=plant), course, mv, row)
         return None if best is None else best.y[: test.sp.shape[1]]
 
     @cached_property
@@ -130,7 +129,7 @@ class OwnEnsemble(Case):
     @cached_property
     def reach(self) -> OperatingRange:
         """The part of its range that the record visited, by the law's model."""
-        return OperatingRange(self._model, self.record)
+        return OperatingRange(self._model, self.record, self.kept_ranges)
 
     @cached_property
     def record(self) -> Record:

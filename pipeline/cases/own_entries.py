@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from loopwright.pipeline.cases.own_model import LAW_PART, MODEL_SET
 from loopwright.pipeline.config.exports import ExportParams, screened_record
+from loopwright.pipeline.config.params import read_section, sections_of
+from loopwright.pipeline.config.plants import PlantParams
 from loopwright.pipeline.records.old_loops import OldController
 
 MEMBER_NUMBERS = (1, 2)  # of the models beside the law's own, on which its tests run
@@ -82,3 +85,34 @@ def _as_pid(loops: Sequence[OldController]) -> dict[str, Any]:
     fields = ("kc", "ti_s", "td_s", "set_point_weight")
     numbers = {name: [float(f"{getattr(law, name):.4g}") for law in loops] for name in fields}
     return {"law": "pid", "tuning": "manual", **{k: v[0] if len(v) == 1 else v for k, v in numbers.items()}}
+
+
+# ---------------------------------------------------------------------------------- what a case reads of these entries
+def sign_held(name: str, params: PlantParams) -> dict[str, int]:
+    """PV -> sign of the gain of its old PI, of a plant of one loop; empty where that is not known.
+
+    An integral part that held its PV has the sign of the plant's own steady gain: with the other one the loop would
+    have run away. With several loops it is the sign with the others at work, which need not be that of the plant.
+    """
+    if len(params.mv) > 1 or f"{name}-{OLD_LOOP}" not in sections_of("controllers", name):
+        return {}
+    kc = read_section("controllers", f"{name}-{OLD_LOOP}").get("kc")
+    return {params.pv[0].name: 1 if kc > 0 else -1} if isinstance(kc, int | float) and kc else {}
+
+
+def kept_ranges(name: str, params: PlantParams) -> dict[str, tuple[float, float]]:
+    """PV -> the range that some law of the plant keeps from its start, by its ``operate`` in params.yaml.
+
+    A set point that asks for a rest beyond it would have to be missed, by the bound's control as well. An entry that is
+    no number is left to the law's design, which says so.
+    """
+    found = {s.name: (-math.inf, math.inf) for s in params.pv}
+    for key in sections_of("controllers", name):
+        operate = read_section("controllers", key).get("operate")
+        given = {
+            k: v for k, v in (operate if isinstance(operate, Mapping) else {}).items() if isinstance(v, int | float)
+        }
+        for pv, (low, high) in found.items():
+            if given.get(f"{pv}.use", 1):
+                found[pv] = max(low, given.get(f"{pv}.low", low)), min(high, given.get(f"{pv}.high", high))
+    return {pv: ends for pv, ends in found.items() if ends != (-math.inf, math.inf)}

@@ -13,7 +13,7 @@ import numpy as np
 
 from loopwright.pipeline.cases.operating_range import ANSWERS_A_SET_POINT
 from loopwright.pipeline.cases.own_ensemble import OwnEnsemble
-from loopwright.pipeline.cases.own_entries import OLD_LOOP
+from loopwright.pipeline.cases.own_entries import OLD_LOOP, kept_ranges, sign_held
 from loopwright.pipeline.cases.own_model import MODEL_SET, GoneWrong, OwnPlant, Untrained, errors_of
 from loopwright.pipeline.cases.own_tests import (
     LEAST_DAILY_ROWS,
@@ -27,7 +27,7 @@ from loopwright.pipeline.cases.own_tests import (
     windows,
 )
 from loopwright.pipeline.config.known import together
-from loopwright.pipeline.config.params import read_section, sections_of
+from loopwright.pipeline.config.params import sections_of
 from loopwright.pipeline.config.plants import MvParams, PlantParams, SignalParams
 from loopwright.pipeline.evaluation.case import Array, Case
 from loopwright.pipeline.evaluation.closed_loop import RANGE_BAND, closed_loop_metrics
@@ -327,7 +327,8 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         "models": models,
         "data": params.data,
         "known": together(params.known),
-        "held": _held(name, params),
+        "held": sign_held(name, params),
+        "kept_ranges": kept_ranges(name, params),
         "read_every": tuple(s.every for s in params.pv) if any(s.every > 1 for s in params.pv) else (),
         "own_metrics": tuple(Metric(mae_of(s), f"MAE {s.name}", unit=s.unit) for s in signals.sp[1:] and signals.sp),
         "__module__": base.__module__,
@@ -339,18 +340,6 @@ def own_case(name: str, base: type[OwnCase] = OwnCase, **further: Any) -> Case:
         ),
     }
     return type("OwnPlantCase", (base,), own | further)((9001, 9002, 9003))
-
-
-def _held(name: str, params: PlantParams) -> dict[str, int]:
-    """PV -> sign of the gain of its old PI, of a plant of one loop; empty where that is not known.
-
-    An integral part that held its PV has the sign of the plant's own steady gain: with the other one the loop would
-    have run away. With several loops it is the sign with the others at work, which need not be that of the plant.
-    """
-    if len(params.mv) > 1 or f"{name}-{OLD_LOOP}" not in sections_of("controllers", name):
-        return {}
-    kc = read_section("controllers", f"{name}-{OLD_LOOP}").get("kc")
-    return {params.pv[0].name: 1 if kc > 0 else -1} if isinstance(kc, int | float) and kc else {}
 
 
 def mae_of(cv: Signal) -> str:

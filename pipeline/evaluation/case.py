@@ -146,6 +146,9 @@ class Case(ABC):
     limits: ClassVar[Mapping[str, tuple[float, float]]] = {}  # state -> its range, for laws and bounds
     noise_draws: ClassVar[int] = 1  # repetitions of a closed loop with noise; figures are averaged
     known: ClassVar[tuple[Known, ...]] = ()  # of pairs of PV and input, by an engineer
+    kept_ranges: ClassVar[
+        Mapping[str, tuple[float, float]]
+    ] = {}  # PV -> its range: no set point asks for a rest beyond
     held: ClassVar[Mapping[str, int]] = {}  # PV -> sign of its answer to the MV, by the old loop that held it with that
     on_models: ClassVar[bool] = False  # the tests run on models of the plant's record
     stand_in: ClassVar[str] = "identified"  # what they run on in the plant's place: such models, or a simulator

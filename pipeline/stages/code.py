@@ -152,7 +152,8 @@ def _read_of(stage: str, case: str) -> list[Any]:
     """Keys of params.yaml that a stage reads beside its own section.
 
     A stage of an own plant reads its signals; a fit which way the loop that it was run by before acts; a design that
-    loop, which stands beside each controller; a report the case too, and which controllers and models it lists.
+    loop, which stands beside each controller; whatever follows a fit the ranges within which set points are drawn; a
+    report the case too, and which controllers and models it lists.
     """
     if not case:
         return []
@@ -161,6 +162,8 @@ def _read_of(stage: str, case: str) -> list[Any]:
         own.append(read_section("controllers", f"{case}-{old}"))
     if stage == "fit" and (held := all_cases()[case].held):
         own.append(dict(held))
+    if stage not in BEFORE_LAWS and (kept := all_cases()[case].kept_ranges):
+        own.append({pv: list(ends) for pv, ends in kept.items()})
     if stage != "report":
         return own
     case_and_plant = [*([read_section("cases", case)] if case in sections("cases") else []), *own]

@@ -20,6 +20,7 @@ from loopwright.pipeline.plants.identified import IdentifiedPlant, StateEquation
 from loopwright.pipeline.plants.simulator import Array, Simulator
 from loopwright.pipeline.simulation.simulate import Trajectory
 from loopwright.serving.controller import Controller
+from loopwright.serving.manifest import OperateEntry
 from loopwright.serving.operating import Operate
 from loopwright.serving.vectorized_controller import ComputeRows, VectorizedController
 
@@ -146,6 +147,12 @@ class Stress:
             return Controller(path)
 
     @cached_property
+    def entries(self) -> tuple[OperateEntry, ...]:
+        """Entries of ``operate`` with what operators have changed as their defaults."""
+        asked = dict(self.operate)
+        return tuple(replace(e, default=asked.get(e.name, e.default)) for e in self.controller.manifest.operate)
+
+    @cached_property
     def operated(self) -> Array | None:
         """Values of ``operate`` (n_operate,); None where they are the defaults. ContractError for a wrong one."""
         return Operate(self.controller.manifest.operate).with_values(dict(self.operate)) if self.operate else None
@@ -223,14 +230,12 @@ class Stress:
         limits: dict[str, list[float]] = {end: [getattr(s, end) for s in mvs] for end in ("low", "high")}
         ends: dict[str, list[float]] = {end: [getattr(s, end) for s in cvs] for end in ("low", "high")}
         jammed = lock_ups(loop.sp, loop.pv[:, :n_cv], loop.mv[:, :n_cv], test.hold, **limits, span=case.asked)
-        asked = dict(self.operate)
-        entries = [replace(e, default=asked.get(e.name, e.default)) for e in self.controller.manifest.operate]
         # A loop that is broken has no figures of worth; as infinite ones they count as worst.
         figures = case.score(test, loop.pv, loop.mv)
         return StressOutcome(
             draw.index,
             dict.fromkeys(figures, float("inf")) if broke else figures,
-            not all(kept_by_ranges(case, test, loop, entries, of) for of in jammed),
+            not all(kept_by_ranges(case, test, loop, self.entries, of) for of in jammed),
             left_limits(loop.pv[:, :n_cv], test.hold, **ends),
             int(loop.info.sum()),
             broke,

@@ -48,6 +48,7 @@ DOWN = tuple(2.0**-i for i in DOUBLINGS)
 SPLIT = 134217729.0  # 2^27 + 1: a double times it gives the double's upper 26 bits
 # 1.5 * 2^12: a number of [0, 1] plus it, less it, is a multiple of 2^-40, of which 4,096 have an exact sum
 GRID = 6144.0
+MOST_SUMMED = 4096  # numbers of a softmax at most: more multiples of 2^-40 up to 1 may have no exact sum
 
 
 def plain_exp(x: float) -> float:

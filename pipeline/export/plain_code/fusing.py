@@ -8,8 +8,9 @@ from math import prod
 
 from loopwright.pipeline.export.plain_code.statements import ELEMENTWISE, Place, PlainProgram, PlainStatement, Then
 
-# Functions in the text keep loops of their own: behind sums, in place of one after the other, they took twice as long.
-CALLED = frozenset({"exp", "log", "tanh", "difference_rest", "exp_rest", "quotient"})
+# Functions of ``elementary`` in the text, in the order in which it has them. They keep loops of their own: behind sums,
+# in place of one after the other, they took twice as long.
+CALLED = ("exp", "log", "tanh", "difference_rest", "exp_rest", "quotient")
 
 
 def fused(program: PlainProgram) -> PlainProgram:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from loopwright.pipeline.export.plain_code.fusing import fused
+from loopwright.pipeline.export.plain_code.fusing import CALLED, fused
 from loopwright.pipeline.export.plain_code.memory import WORK, in_one_memory, laid_out, without_copies
 from loopwright.pipeline.export.plain_code.rounds import Block, in_rounds
 from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, PlainProgram
@@ -14,7 +14,7 @@ WIDTH = 100  # characters of a line of numbers
 COUNTERS, ROUND_COUNTERS = "ijklmn", "rqp"  # of loops and of rounds, outer ones first
 EXTREMES: Mapping[str, str] = {"largest": "max", "least": "min"}
 # Operations that are functions of ``elementary``.
-OWN: Mapping[str, str] = {op: f"plain_{op}" for op in ("exp", "log", "tanh", "difference_rest", "exp_rest", "quotient")}
+OWN: Mapping[str, str] = {op: f"plain_{op}" for op in CALLED}
 INFIX: Mapping[str, str] = {"add": "+", "sub": "-", "mul": "*", "div": "/"}
 
 

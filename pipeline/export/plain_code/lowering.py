@@ -12,7 +12,7 @@ import onnx
 from onnx import numpy_helper
 
 from loopwright.pipeline.errors import ExportError
-from loopwright.pipeline.export.plain_code.elementary import GRID
+from loopwright.pipeline.export.plain_code.elementary import GRID, MOST_SUMMED
 from loopwright.pipeline.export.plain_code.interpreter import run_statement
 from loopwright.pipeline.export.plain_code.statements import OUTPUT, Floats, Place, Places, PlainProgram, PlainStatement
 from loopwright.pipeline.export.plain_code.views import View
@@ -26,7 +26,6 @@ ONE_OF_TWO = {
     "Less": "less", "LessOrEqual": "less_equal", "Mul": "mul", "Or": "or", "Sub": "sub",
 }  # fmt: skip
 WHOLE = (onnx.TensorProto.BOOL, onnx.TensorProto.INT64, onnx.TensorProto.INT32)
-MOST_SUMMED = 4096  # multiples of 2^-40 up to 1, see ``elementary.GRID``
 REDUCED = {"ReduceSum": "sum", "ReduceSumSquare": "sum_squares", "ReduceMax": "largest", "ReduceMin": "least"}
 
 
