@@ -16,6 +16,52 @@ class Clock(Protocol):
         """Return at ``time_s`` [s] at the earliest; at once if that has passed."""
 
 
+class EndingClock(Clock, Protocol):
+    """A clock whose sleeps end early once nobody is to wait any more."""
+
+    def end(self) -> None:
+        """Let every sleep return, also one that has begun; from any thread."""
+
+
+class Time(Protocol):
+    """Time as a loop's machine has it, beside the clock of the scans."""
+
+    def wall_s(self) -> float:
+        """Seconds since 1970, which somebody may set."""
+
+    def steady_s(self) -> float:
+        """Seconds that never go back."""
+
+    def wait(self, seconds: float) -> None:
+        """Return after so many seconds."""
+
+    def paced(self, speed: float) -> EndingClock:
+        """A clock for scans, ``speed`` times as fast."""
+
+
+class MachineTime:
+    """The time of this machine."""
+
+    def wall_s(self) -> float:
+        """Seconds since 1970."""
+        return time.time()
+
+    def steady_s(self) -> float:
+        """Seconds that never go back."""
+        return time.monotonic()
+
+    def wait(self, seconds: float) -> None:
+        """Sleep."""
+        time.sleep(seconds)
+
+    def paced(self, speed: float) -> EndingClock:
+        """A clock for scans."""
+        return MonotonicClock(speed)
+
+
+MACHINE_TIME = MachineTime()
+
+
 class MonotonicClock:
     """The machine's monotonic clock, ``speed`` times as fast.
 

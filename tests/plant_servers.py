@@ -24,6 +24,7 @@ from loopwright.pipeline.simulation import opcua_server
 from loopwright.serving import Command, Controller, LoopError, Mode, Sample
 from loopwright.serving.journal import JournalReader, ScanEntry
 from loopwright.serving.station.control import ask
+from loopwright.serving.station.machine import THIS_MACHINE, Machine
 from loopwright.serving.station.requests import Change
 from loopwright.serving.station.settings import Settings
 from loopwright.serving.station.station import Station
@@ -163,14 +164,14 @@ class RunningLoop:
 
     begun: ClassVar[list[RunningLoop]] = []  # that may run still
 
-    def __init__(self, settings: Path | Settings) -> None:
+    def __init__(self, settings: Path | Settings, machine: Machine = THIS_MACHINE) -> None:
         self.settings = Settings.read(settings) if isinstance(settings, Path) else settings
         self.told: list[str] = []
         self.commands: list[Command] = []
         self.marks = 0  # in the journal
         where = self.settings  # loaded here: no process has to try the first steps of a test's file
         loaded = Controller(where.controller, where.sha256 or None, where.trusted)
-        self.station = Station(where, tell=self.told.append, controller=loaded)
+        self.station = Station(where, tell=self.told.append, controller=loaded, machine=machine)
         self.station.watch(self._seen)
         self.thread = threading.Thread(target=self.station.run, daemon=True)
         self.thread.start()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from loopwright.serving import Controller, Sample
+from loopwright.serving import Controller, Sample, VirtualClock
+from loopwright.serving.clock import MachineTime
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.opcua.settings import Nodes, Server
+from loopwright.serving.station.machine import Machine
 from loopwright.serving.station.settings import Settings
 
 SERVER = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
@@ -18,6 +21,18 @@ def settings_of(controller: Controller, **changed: Any) -> Settings:
     m = controller.manifest
     nodes = {g: {s.name: f"ns=2;s={s.name}" for s in m.signals(g)} for g in ("pv", "dv", "mv")}
     return Settings(controller.path, SERVER, Nodes(**nodes), start="MANUAL", **changed)
+
+
+class HurriedTime(MachineTime):
+    """The machine's, but no scan waits for its period."""
+
+    def paced(self, speed: float) -> VirtualClock:
+        return VirtualClock()
+
+
+def still_machine(folder: Path, endpoint: Any = None) -> Machine:
+    """A machine whose plant is ``endpoint``, one that stands still unless given, and whose locks lie in a folder."""
+    return Machine(time=HurriedTime(), endpoint=endpoint or StillPlant, locks=folder / "locks")
 
 
 class StillPlant:

@@ -7,7 +7,6 @@ import math
 import os
 import sqlite3
 import threading
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import astuple
@@ -18,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from loopwright.serving.clock import MACHINE_TIME, Time
 from loopwright.serving.errors import LoopError
 from loopwright.serving.journal.entries import EventEntry, ScanEntry, columns, packed
 from loopwright.serving.journal.file import held, holds, is_damage, opened, sole_writer
@@ -111,8 +111,9 @@ class Journal:
         max_mb: float = 2000.0,
         fsync: Literal["power loss", "crash"] = "crash",
         tell: Callable[[str], None] = lambda _: None,
+        time: Time = MACHINE_TIME,
     ) -> None:
-        self.path, self.max_bytes, self.tell = path, max_mb * 1e6, tell
+        self.path, self.max_bytes, self.tell, self._time = path, max_mb * 1e6, tell, time
         self.trouble = ""
         self._fsync = fsync
         self._most_events = self._events = most_events(self.max_bytes)  # written since the last look at how many
@@ -134,6 +135,9 @@ class Journal:
         self._told = 0  # of what is lost, as much as stands in the journal
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+        self._start()
+
+    def _start(self) -> None:
         self._thread.start()
 
     @property
@@ -170,11 +174,7 @@ class Journal:
         """Write what waits and end. A disk that does not answer for ``CLOSE_S`` is waited for no longer, and told."""
         self._closing.set()
         self._queue.wake()
-        waiting = None
-        while self._thread.is_alive() and waiting != self.behind:
-            waiting = self.behind
-            self._thread.join(CLOSE_S)
-        if self._thread.is_alive():  # which has the file open still
+        if not self._finished():  # the thread has the file open still
             n = self._queue.give_up()
             end = f"the last {n} scans and events are lost" if n else "nothing waits to be written"
             self.tell(f"the journal's disk does not answer: {end}")
@@ -182,59 +182,75 @@ class Journal:
         self._base.close()
         os.close(self._lock)
 
+    def _finished(self) -> bool:
+        """Wait until all is written; False where the disk does not answer."""
+        waiting = None
+        while self._thread.is_alive() and waiting != self.behind:
+            waiting = self.behind
+            self._thread.join(CLOSE_S)
+        return not self._thread.is_alive()
+
     def _put(self, kind: str, row: Any) -> None:
         if self._queue.put((kind, row), WAITING_ENTRIES):
             self.tell(f"the journal has {WAITING_ENTRIES} scans and events that wait: from now on the oldest are lost")
         since = self._writing_s
-        if since is not None and not self.trouble and time.monotonic() - since > STALL_S:
+        if since is not None and not self.trouble and self._time.steady_s() - since > STALL_S:
             what = "its file is being made again" if self._making else "the disk has not answered"
             self.trouble = f"{what} for {STALL_S:g} s"
             self.tell(f"the journal cannot be written: {self.trouble}")
 
     # ------------------------------------------------------------------ the writer
     def _run(self) -> None:
-        while True:
-            self._take()
-            last = not self._taken and self._closing.is_set()
-            self._writing_s = time.monotonic()
-            try:
-                self._tend()
-                if last:
-                    return
-                self._write()
-                self._queue.written()
-                lost = self.lost - self._told
-                if self.trouble or lost:
-                    self.tell("the journal writes again" + (LOSS.format(lost) if lost else ""))
-                self.trouble = ""
-                if lost:
-                    what = "the journal could not be written" + LOSS.format(lost)
-                    self._note(alarm(time.time(), what, "over: it writes again"))
-                    self._told += lost
-                self._pack()
-                self._rotate()
-            except Exception as error:
-                with suppress(sqlite3.Error):
-                    self._base.rollback()
-                if not self.trouble:
-                    self.tell(f"the journal cannot be written: {named(error)}")
-                self.trouble = named(error)
-                damaged = self._harm is None and is_damage(error)
-                self._harm = FileChange.DAMAGED if damaged else self._harm
-                if self._closing.is_set() and not damaged:
-                    self._give_up()
-                    return
-                self._queue.give_back(WAITING_ENTRIES)
-            finally:
-                self._writing_s = None
+        """Wait for something to write, gather, unless enough waits already, and write."""
+        ended = False
+        while not ended:
+            if not self._closing.is_set():
+                self._queue.wait()
+            if self.trouble or len(self._queue) < TRANSACTION_ENTRIES:
+                self._closing.wait(self.gathers_s)
+            ended = self._turn()
 
-    def _take(self) -> None:
-        """Wait for something to write, then gather for ``FLUSH_S``, unless enough waits already."""
-        if not self._closing.is_set():
-            self._queue.wait()
-        if self.trouble or len(self._queue) < TRANSACTION_ENTRIES:
-            self._closing.wait(FLUSH_S if self._harm is None else AGAIN_S)
+    @property
+    def gathers_s(self) -> float:
+        """How long [s] it waits for more before it writes."""
+        return FLUSH_S if self._harm is None else AGAIN_S
+
+    def _turn(self) -> bool:
+        """Write what waits, as far as the disk takes it now; whether nothing will be written any more."""
         self._taken = self._queue.take(TRANSACTION_ENTRIES)
+        last = not self._taken and self._closing.is_set()
+        self._writing_s = self._time.steady_s()
+        try:
+            self._tend()
+            if last:
+                return True
+            self._write()
+            self._queue.written()
+            lost = self.lost - self._told
+            if self.trouble or lost:
+                self.tell("the journal writes again" + (LOSS.format(lost) if lost else ""))
+            self.trouble = ""
+            if lost:
+                what = "the journal could not be written" + LOSS.format(lost)
+                self._note(alarm(self._time.wall_s(), what, "over: it writes again"))
+                self._told += lost
+            self._pack()
+            self._rotate()
+        except Exception as error:
+            with suppress(sqlite3.Error):
+                self._base.rollback()
+            if not self.trouble:
+                self.tell(f"the journal cannot be written: {named(error)}")
+            self.trouble = named(error)
+            damaged = self._harm is None and is_damage(error)
+            self._harm = FileChange.DAMAGED if damaged else self._harm
+            if self._closing.is_set() and not damaged:
+                self._give_up()
+                return True
+            self._queue.give_back(WAITING_ENTRIES)
+        finally:
+            self._writing_s = None
+        return False
 
     def _write(self) -> None:
         run, row, ids, n = self._run_id, self._run_row, dict(self._ids), 0
@@ -309,7 +325,7 @@ class Journal:
         """
         path, old = self._files.path, self._base
         copy = None if harm is FileChange.DAMAGED else copied(old, path)
-        again = harm is FileChange.REPLACED and time.monotonic() - self._made_s < 2 * AGAIN_S
+        again = harm is FileChange.REPLACED and self._time.steady_s() - self._made_s < 2 * AGAIN_S
         self._replaced = self._replaced + 1 if again else 0
         unsteady = self._files.steady and self._replaced >= UNSTEADY
         self._files.steady = self._files.steady and not unsteady
@@ -328,14 +344,14 @@ class Journal:
         with suppress(sqlite3.Error):
             old.close()
         self._files = OpenFiles(path, steady=self._files.steady)
-        self._made_s = time.monotonic()
+        self._made_s = self._time.steady_s()
         lost, self._held = max(0, self._held - held(self._base)), held(self._base)
         self._queue.lost, self._told = self._queue.lost + lost, self._told + lost
         self._go_on()
         self._harm = None
         what = made_again(harm, lost, empty=copy is None, aside=aside, unsteady=unsteady)
         self.tell(what)
-        self._note(alarm(time.time(), what, "over: it is made again"))
+        self._note(alarm(self._time.wall_s(), what, "over: it is made again"))
 
     def _go_on(self) -> None:
         """Number the rows of a file that lacks some as the one before: whoever saw a row asks for those after it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import TypeAlias
@@ -68,6 +68,8 @@ class OpcUaEndpoint:
         The namespaces by number that an earlier run found behind the ids.
     identified
         Called at each connection, before anything is written, with what it is to.
+    connect
+        Opens a connection: ``Link.opened`` unless given.
 
     Raises
     ------
@@ -87,10 +89,11 @@ class OpcUaEndpoint:
         clock: Callable[[], float] = time.monotonic,
         spaces: Mapping[int, str] | None = None,
         identified: Callable[[Identity], object] = lambda _: None,
+        connect: Callable[[Server, float], Awaitable[Link]] = Link.opened,
     ) -> None:
         nodes.check(manifest)
         self.manifest, self.server, self.nodes = manifest, server, nodes
-        self.speed, self.tell, self.clock = speed, tell, clock
+        self.speed, self.tell, self.clock, self._connect = speed, tell, clock, connect
         self.max_age_s, self.period_s = max_age_s / speed, manifest.period_s / speed  # of the machine's time
         self.answer_s = min(ANSWER_PART * self.period_s, LONGEST_OPC_ANSWER_S)
         self._slowest_s = MOST_LEAD * self.period_s  # until answers are known
@@ -236,7 +239,7 @@ class OpcUaEndpoint:
         pause = FIRST_RETRY_S
         while not self._closed.is_set():
             try:
-                link = await Link.opened(self.server, self.period_s)
+                link = await self._connect(self.server, self.period_s)
             except Exception as error:
                 self._lost(first_line(error), late=isinstance(error, LateError))
                 await self._rest(pause)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -53,7 +53,8 @@ async def in_pieces(
     A server may refuse more than it told, or have told nothing: the pieces then become half as large. Raises what
     ``ask`` raises, and TooManyError where the server refuses a single row.
     """
-    end, left_s, found = time.monotonic() + timeout_s, timeout_s, list[R]()
+    now = asyncio.get_running_loop().time
+    end, left_s, found = now() + timeout_s, timeout_s, list[R]()
     while len(found) < len(rows):
         piece = rows[len(found) : len(found) + pieces.most] if pieces.most else rows[len(found) :]
         try:
@@ -64,7 +65,7 @@ async def in_pieces(
             pieces.most = len(piece) // 2
             continue
         finally:
-            left_s = max(end - time.monotonic(), 0.0)
+            left_s = max(end - now(), 0.0)
         if len(answers) != len(piece):
             raise EndpointError(f"the server gives {len(answers)} answers to a request for {len(piece)} nodes")
         found += answers

@@ -57,13 +57,14 @@ class Link:
         self.limits = OperationLimits()
 
     @classmethod
-    async def opened(cls, server: Server, period_s: float = 0.0) -> Link:
+    async def opened(cls, server: Server, period_s: float = 0.0, client_of: Callable[..., Client] = Client) -> Link:
         """Connect and log on, within ``server.connect_s``. EndpointError names what refused.
 
-        ``period_s`` [s of the machine's clock] lies between two requests of the loop.
+        ``period_s`` [s of the machine's clock] lies between two requests of the loop. ``client_of`` makes the client of
+        an endpoint, asyncua's unless given.
         """
         # What this class does itself, with deadlines of its own, the library need not do beside it.
-        client = Client(server.endpoint, timeout=server.connect_s, watchdog_intervall=1e6)
+        client = client_of(server.endpoint, timeout=server.connect_s, watchdog_intervall=1e6)
         client.application_uri = APPLICATION
         client.session_timeout = 1000 * min(max(LEAST_SESSION_S, SESSION * period_s), MOST_SESSION_S)
         link = cls(client, server)

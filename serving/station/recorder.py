@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
 from math import ceil, nan
@@ -13,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from loopwright.serving.clock import MACHINE_TIME, Time
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError
 from loopwright.serving.guard import Sample, kind_of, lasting
@@ -31,8 +31,10 @@ Array: TypeAlias = NDArray[np.float64]
 class Recorder:
     """Writes scans and events into a journal, and says each event as a line."""
 
-    def __init__(self, journal: Journal, say: Callable[[str], None], speed: float = 1.0) -> None:
-        self.journal, self._say, self._speed = journal, say, speed
+    def __init__(
+        self, journal: Journal, say: Callable[[str], None], speed: float = 1.0, time: Time = MACHINE_TIME
+    ) -> None:
+        self.journal, self._say, self._speed, self.time = journal, say, speed, time
         self._controller: Controller | None = None
         self._fault, self._trial, self._mode = "", "", ""
         self._bad: dict[str, bool] = {}  # PVs that were bridged, or left out (True)
@@ -54,7 +56,7 @@ class Recorder:
     def begin(self, controller: Controller) -> None:
         """The scans that follow are of this controller."""
         self._controller = controller
-        self.journal.begin(controller.manifest, controller.sha256, time.time(), self._speed)
+        self.journal.begin(controller.manifest, controller.sha256, self.time.wall_s(), self._speed)
 
     def note(
         self,
@@ -75,7 +77,7 @@ class Recorder:
         what, reason = plain(what), plain(reason)
         if mode is not None:
             self._mode = mode.value
-        self.journal.event(EventEntry(time.time(), kind, who, what, reason, alarm, raised, about))
+        self.journal.event(EventEntry(self.time.wall_s(), kind, who, what, reason, alarm, raised, about))
         said = f"acknowledged: {what}" if kind == "acknowledged" else what
         self._say(f"{who}: {said}" + (f" ({reason})" if reason else ""))
 
@@ -83,7 +85,7 @@ class Recorder:
         """Write a scan down, and the fault or the new controller that came with it."""
         numbers = tuple(map(float, _numbers(self.controller.manifest, sample, command)))
         quality = () if sample is None else sample.quality
-        self.journal.scan(ScanEntry(time.time(), command.mode.value, numbers, quality, command.fault))
+        self.journal.scan(ScanEntry(self.time.wall_s(), command.mode.value, numbers, quality, command.fault))
         # A reason whose numbers change, such as an age, is the same fault.
         if command.fault != self._fault and kind_of(command.fault) != kind_of(self._fault):
             before, self._fault = self._fault, command.fault
@@ -226,7 +228,7 @@ class MonitorRunner:
 
     def _this_week(self) -> WeeklyCounts:
         """The counts of the present week that a loop before this one has left."""
-        week, kept = week_of(time.time()), None
+        week, kept = week_of(self._recorder.time.wall_s()), None
         with suppress(LoopError, sqlite3.Error), closing(JournalReader(self._recorder.journal.path)) as reader:
             kept = reader.learnt(f"{WEEK}{week}")
         if kept is not None:
@@ -256,11 +258,11 @@ class MonitorRunner:
                 return Monitor.restored(controller.manifest, json.loads(kept))
             except (ValueError, RecursionError) as error:
                 return self._anew(controller, str(error))
-        return Monitor(controller.manifest, started_s=time.time())
+        return Monitor(controller.manifest, started_s=self._recorder.time.wall_s())
 
     def _anew(self, controller: Controller, why: str) -> Monitor:
         self._recorder.note("monitor", "monitor", f"what was learnt cannot be used, so it learns anew: {why}")
-        return Monitor(controller.manifest, started_s=time.time())
+        return Monitor(controller.manifest, started_s=self._recorder.time.wall_s())
 
     def _failed(self, trouble: str) -> None:
         """Say once what failed."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -12,16 +11,14 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from loopwright.serving.clock import MonotonicClock
 from loopwright.serving.controller import Controller
 from loopwright.serving.errors import LoopError, LoopwrightError
 from loopwright.serving.first_steps import tried
 from loopwright.serving.guard import Sample
-from loopwright.serving.journal import Journal, JournalReader
+from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command, ControlLoop, Mode
 from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.certificates import expiries
-from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.nameplates import Identity, others_since
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.page.process import PageProcess
@@ -38,9 +35,10 @@ from loopwright.serving.station.build_loop import (
     usable,
 )
 from loopwright.serving.station.control import Answer, Control
-from loopwright.serving.station.housekeeping import LinePrinter, PeriodicTask
+from loopwright.serving.station.housekeeping import LinePrinter
 from loopwright.serving.station.last_courses import LastCourses
 from loopwright.serving.station.last_run import Steered
+from loopwright.serving.station.machine import THIS_MACHINE, Machine
 from loopwright.serving.station.mv_lock import Lease, Locks
 from loopwright.serving.station.plant_side import PlantSide, shown_values
 from loopwright.serving.station.recorder import MonitorRunner, Recorder
@@ -69,7 +67,7 @@ class Station:
 
     ``tell`` gets a line of each event, in a thread of its own: it may block or raise. ``controller`` is the one of the
     settings' file; None: it is loaded here, once another process has taken its first steps
-    (``loopwright.serving.first_steps``).
+    (``loopwright.serving.first_steps``). ``machine`` is the one that it runs on.
 
     Raises LoopError and ArtifactError where the settings do not fit the controller, another loop writes the same
     nodes, or the journal cannot be opened.
@@ -81,7 +79,9 @@ class Station:
         *,
         tell: Callable[[str], None] = lambda _: None,
         controller: TrustedController | None = None,
+        machine: Machine = THIS_MACHINE,
     ) -> None:
+        self.machine, self.time = machine, machine.time
         self.settings, self.printer = settings, LinePrinter(tell)
         self.tell = tell = self.printer.say
         self.trusted = self._public_keys()
@@ -90,8 +90,8 @@ class Station:
         m = self.manifest
         age = settings.max_age_s(m.period_s)
         control_loop(settings, self.controller)  # settings that do not fit it are said before it is connected
-        self.clock = MonotonicClock(settings.speed)
-        self.endpoint = OpcUaEndpoint(
+        self.clock = self.time.paced(settings.speed)
+        self.endpoint = machine.endpoint(
             m,
             settings.server,
             settings.nodes,
@@ -102,17 +102,16 @@ class Station:
             identified=self._identified,
         )
         points = settings.nodes.points("mv").values()
-        self.lease = Lease(settings.server.endpoint, [p.node for p in points])
+        self.lease = Lease(settings.server.endpoint, [p.node for p in points], machine.locks)
         try:
-            self.journal = Journal(
-                settings.journal.file, max_mb=settings.journal.max_mb, fsync=settings.journal.fsync, tell=tell
-            )
+            kept = settings.journal
+            self.journal = machine.journal(kept.file, max_mb=kept.max_mb, fsync=kept.fsync, tell=tell, time=self.time)
         except BaseException:
             self.lease.release()
             raise
         self._steered = Steered.before(settings.journal.file)
         self._courses = LastCourses.before(settings.journal.file)
-        self.recorder = Recorder(self.journal, tell, settings.speed)
+        self.recorder = Recorder(self.journal, tell, settings.speed, self.time)
         self.recorder.end_old_alarms()
         self.locks = Locks(self.lease, self.recorder)
         self.watching = MonitorRunner(self.controller, self.recorder)
@@ -165,9 +164,9 @@ class Station:
         with ExitStack() as stack:
             for held in (self.printer.end, self.lease.release, self.journal.close):
                 stack.callback(held)
-            control = Control(s.journal.file, self.answer)
+            control = self.machine.door(s.journal.file, self.answer)
             stack.callback(control.close)
-            stack.callback(PeriodicTask(lambda: self._tend(control), self.locks.untended).close)
+            stack.callback(self.machine.tended(lambda: self._tend(control), self.locks.untended).close)
             self._serve(stack, control)
             stack.callback(self.watching.keep)
             stack.callback(self.endpoint.close)
@@ -219,7 +218,7 @@ class Station:
         while not usable(self.endpoint.values) and not self.ended:
             if self.settings.start == "SHADOW" and waited >= limit:
                 return None
-            time.sleep(FIRST_VALUES_POLL_S)
+            self.time.wait(FIRST_VALUES_POLL_S)
             if waited < SILENCE_S <= waited + FIRST_VALUES_POLL_S:
                 self.tell("the plant gives no values yet: the loop goes on trying; Ctrl-C ends it")
             waited += FIRST_VALUES_POLL_S
@@ -256,10 +255,10 @@ class Station:
 
         if self.settings.restore:
             self._steered.restore(loop, note)
-            self._courses.restore(loop, note, time.time(), self.settings.speed)
+            self._courses.restore(loop, note, self.time.wall_s(), self.settings.speed)
         else:
             self._steered.compare(loop, note)
-            self._courses.compare(loop, note, time.time())
+            self._courses.compare(loop, note, self.time.wall_s())
 
     def _at_last(self, loop: ControlLoop) -> None:
         """A shadow that began without the plant begins at its PVs once it sees them, unless a set point was named."""
@@ -275,7 +274,7 @@ class Station:
         assert self.loop is not None
         self._moved(self.loop)
         self.scans, self._faults = self.scans + 1, self._faults + bool(command.fault)
-        seen, stepped = (sample, command, time.time()), self.recorder.controller
+        seen, stepped = (sample, command, self.time.wall_s()), self.recorder.controller
         if self.loop.controller is not stepped:
             self.endpoint.serve(self.loop.controller.manifest)
         if not np.isnan(command.mv).any():
@@ -332,9 +331,9 @@ class Station:
             return self._acknowledge(request)
         if self.loop is None:
             raise LoopError(f"the loop has not begun yet: {self.endpoint.trouble}")
-        wanted = change(request, self.loop, self._opened)
         said = queue.SimpleQueue[str]()
-        self.ask(replace(wanted, done=said.put))
+        wanted = replace(change(request, self.loop, self._opened), done=said.put)
+        self.ask(wanted)
         period = self.manifest.period_s / self.settings.speed
         try:
             refused = said.get(timeout=min(2 * period, LONGEST_SCAN_WAIT_S))

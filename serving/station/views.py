@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from math import isfinite
@@ -133,7 +132,7 @@ def about(station: Station) -> View:
 
 def state(station: Station) -> View:
     """How the loop stands now."""
-    seen, now = station.snapshot, time.time()
+    seen, now = station.snapshot, station.time.wall_s()
     if seen is None:
         trouble = station.endpoint.trouble
         return {

@@ -11,16 +11,14 @@ from typing import Any
 
 import pytest
 from fake_loop import FakeLoop
-from still_station import StillPlant, settings_of
+from still_station import settings_of, still_machine
 
 from loopwright.pipeline.__main__ import main
-from loopwright.serving import Controller, LoopError, Sample, VirtualClock
+from loopwright.serving import Controller, LoopError, Sample
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command
 from loopwright.serving.preview.course_file import courses_of
-from loopwright.serving.station import station
 from loopwright.serving.station.build_loop import control_loop
-from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.requests import Request, change
 from loopwright.serving.station.settings import JournalSettings
 from loopwright.serving.station.station import Station
@@ -31,12 +29,9 @@ COURSE = {"points": {"y0": [[2, 0.5]], "d0": [[0, 0.0], [3, 0.2]], "y1": [[50, 1
 
 
 @pytest.fixture
-def made(previewing: Controller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Station:
-    monkeypatch.setattr(station, "OpcUaEndpoint", StillPlant)
-    monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
-    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
+def made(previewing: Controller, tmp_path: Path) -> Station:
     settings = settings_of(previewing, journal=JournalSettings(tmp_path / "loop.journal"))
-    return Station(settings, controller=Controller(previewing.path))  # type: ignore[arg-type]
+    return Station(settings, controller=Controller(previewing.path), machine=still_machine(tmp_path))  # type: ignore[arg-type]
 
 
 def ran(made: Station, scans: int, **at: Callable[[], None]) -> tuple[list[Command], list[str]]:

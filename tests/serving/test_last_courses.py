@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from still_station import StillPlant, settings_of
+from still_station import settings_of, still_machine
 
-from loopwright.serving import Controller, ControlLoop, Sample, VirtualClock
+from loopwright.serving import Controller, ControlLoop, Sample
 from loopwright.serving.journal import Journal, JournalReader
-from loopwright.serving.station import station
 from loopwright.serving.station.last_courses import COURSES, DatedCourse, LastCourses
-from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.settings import JournalSettings
 from loopwright.serving.station.station import Station
 
@@ -158,19 +156,16 @@ def test_a_journal_that_does_not_tell_stops_nothing(
 
 
 # ------------------------------------------------------------------------------------------------ a station of a file
-def started(controller: Controller, folder: Path, monkeypatch: pytest.MonkeyPatch, restore: bool) -> Station:
-    monkeypatch.setattr(station, "OpcUaEndpoint", StillPlant)
-    monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
-    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, folder / "locks"))
+def started(controller: Controller, folder: Path, restore: bool) -> Station:
     settings = settings_of(controller, journal=JournalSettings(folder / "loop.journal"), restore=restore)
-    return Station(settings, controller=Controller(controller.path))  # type: ignore[arg-type]
+    return Station(settings, controller=Controller(controller.path), machine=still_machine(folder))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("restore", [True, False])
 def test_a_station_that_is_restarted_says_what_stood_and_takes_it_back(
-    previewing: Controller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, restore: bool
+    previewing: Controller, tmp_path: Path, restore: bool
 ) -> None:
-    first = started(previewing, tmp_path, monkeypatch, restore)
+    first = started(previewing, tmp_path, restore)
 
     def give(*_: object) -> None:
         if first.scans == 1:
@@ -179,7 +174,7 @@ def test_a_station_that_is_restarted_says_what_stood_and_takes_it_back(
 
     first.watch(give)
     first.run(6)
-    second = started(previewing, tmp_path, monkeypatch, restore)
+    second = started(previewing, tmp_path, restore)
     seen: list[float] = []
     second.watch(lambda _, command: seen.append(float(command.sp[0])))
     second.run(3)

@@ -65,20 +65,17 @@ def test_what_a_library_raises_is_an_error_and_no_cancellation(raised: BaseExcep
     asyncio.run(run())
 
 
-def test_whatever_ends_the_thread_the_plant_is_to_be_reached_again(
-    monkeypatch: pytest.MonkeyPatch, controller: Controller
-) -> None:
+def test_whatever_ends_the_thread_the_plant_is_to_be_reached_again(controller: Controller) -> None:
     tries, told = [0], list[str]()
 
     async def opened(_: Server, __: float) -> Link:
         tries[0] += 1
         raise OwnKindOfCancellation if tries[0] == 1 else OSError("refused")
 
-    monkeypatch.setattr(Link, "opened", opened)
     m = controller.manifest
     nodes = Nodes(**{g: {s.name: "ns=2;s=x" for s in m.signals(g)} for g in ("pv", "mv", "dv")})
     server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True)
-    endpoint = OpcUaEndpoint(m, server, nodes, max_age_s=1.0, tell=told.append)
+    endpoint = OpcUaEndpoint(m, server, nodes, max_age_s=1.0, tell=told.append, connect=opened)
     endpoint.start()
     try:
         assert within(10, lambda: tries[0] > 2)

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from asyncua import ua
 from fake_loop import FakeLoop
+from still_station import still_machine
 
 from loopwright.pipeline.__main__ import main
-from loopwright.serving import Controller, LoopError, Mode, Sample, VirtualClock
+from loopwright.serving import Controller, LoopError, Mode, Sample
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command
 from loopwright.serving.manifest import Manifest
@@ -25,9 +26,7 @@ from loopwright.serving.opcua.plan import NodePlan
 from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import AnalyserNode, Nodes, Point, Server
 from loopwright.serving.opcua.values import NodeReading
-from loopwright.serving.station import station
 from loopwright.serving.station.build_loop import control_loop
-from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.requests import Request, change
 from loopwright.serving.station.settings import Bridge, JournalSettings, Settings, template
 from loopwright.serving.station.station import Station
@@ -194,15 +193,12 @@ class Plant:
 
 
 @pytest.fixture
-def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Station]:
-    monkeypatch.setattr(station, "OpcUaEndpoint", Plant)
-    monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
-    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
-
+def make_station(tmp_path: Path) -> Callable[..., Station]:
     def make(controller: Controller, **changed: Any) -> Station:
         journal = JournalSettings(tmp_path / "loop.journal")
         made = settings_of(controller, journal=journal, **changed)
-        return Station(made, controller=Controller(controller.path))  # type: ignore[arg-type]
+        machine = still_machine(tmp_path, Plant)
+        return Station(made, controller=Controller(controller.path), machine=machine)  # type: ignore[arg-type]
 
     return make
 

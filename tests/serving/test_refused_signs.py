@@ -13,7 +13,7 @@ from processes import within
 
 from loopwright.serving import Controller, EndpointError
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
-from loopwright.serving.opcua.link import Link, node_id
+from loopwright.serving.opcua.link import node_id
 from loopwright.serving.opcua.settings import Nodes, Server
 from loopwright.serving.opcua.values import LateError, NodeReading
 
@@ -102,8 +102,13 @@ class Scanning:
             max_age_s=max_age_s,
             speed=25.0,
             tell=self.told.append,
+            connect=self._connected,
         )
         self.endpoint.start()
+
+    async def _connected(self, *_: object) -> Any:
+        self.link.opened += 1
+        return self.link
 
     def scan(self) -> str:
         """What is wrong with the sample or the last MV; empty: nothing."""
@@ -124,15 +129,8 @@ class Scanning:
 
 
 @pytest.fixture
-def link(monkeypatch: pytest.MonkeyPatch) -> MadeUpLink:
-    made = MadeUpLink()
-
-    async def opened(_: Server, __: float) -> MadeUpLink:
-        made.opened += 1
-        return made
-
-    monkeypatch.setattr(Link, "opened", opened)
-    return made
+def link() -> MadeUpLink:
+    return MadeUpLink()
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -24,9 +25,9 @@ from loopwright.serving import Mode
 from loopwright.serving.errors import LoopError
 from loopwright.serving.opcua.nameplates import Identity
 from loopwright.serving.opcua.node_lease import SCANS, NodeLease
-from loopwright.serving.station import station
 from loopwright.serving.station.control import Control, ask, door
 from loopwright.serving.station.housekeeping import PeriodicTask
+from loopwright.serving.station.machine import Machine
 from loopwright.serving.station.mv_lock import Lease, Locks, address_of
 
 SPEED = 2.0  # periods of .25 s: a loop counts as gone after five without a renewal
@@ -42,11 +43,11 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
     made.end()
 
 
-def machine(folder: Path, plant: Plant, start: str, monkeypatch: pytest.MonkeyPatch, nodes: str = LEASE) -> RunningLoop:
+def machine(folder: Path, plant: Plant, start: str, nodes: str = LEASE, **parts: Any) -> RunningLoop:
     """A loop that another one finds by the node alone: its file locks lie in a folder of its own."""
     folder.mkdir(mode=0o700)
-    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, folder))
-    return RunningLoop(loop_toml(folder, plant.endpoint, speed=SPEED, start=start, nodes=nodes, more=PATIENT))
+    made = loop_toml(folder, plant.endpoint, speed=SPEED, start=start, nodes=nodes, more=PATIENT)
+    return RunningLoop(made, Machine(locks=folder, **parts))
 
 
 def lease(plant: Plant, text: str | None = None) -> Any:
@@ -67,13 +68,11 @@ def mode(loop: RunningLoop) -> tuple[Mode, str]:
     return loop.station.snapshot.command.mode, loop.station.snapshot.command.fault
 
 
-def test_the_second_loop_holds_until_the_first_is_gone(
-    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_second_loop_holds_until_the_first_is_gone(plant: Plant, tmp_path: Path) -> None:
     """Neither is told of a lease: both find the plant's own."""
-    first = machine(tmp_path / "a", plant, "AUTO", monkeypatch, nodes="")
+    first = machine(tmp_path / "a", plant, "AUTO", nodes="")
     assert within(20, lambda: first.station.endpoint.sender.lease.held and mode(first)[0] is Mode.AUTO)
-    second = machine(tmp_path / "b", plant, "SHADOW", monkeypatch, nodes="")
+    second = machine(tmp_path / "b", plant, "SHADOW", nodes="")
     try:
         # A shadow beside it needs no lease and takes none.
         assert within(10, lambda: second.station.scans > 10)
@@ -135,11 +134,9 @@ def test_check_finds_the_lease_beside_the_mvs(
     assert ("note: lease: there is none" in said) is note
 
 
-def test_a_lease_of_a_loop_that_was_killed_is_taken_over(
-    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_lease_of_a_loop_that_was_killed_is_taken_over(plant: Plant, tmp_path: Path) -> None:
     lease(plant, "elsewhere:17:abc 41")
-    loop = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
+    loop = machine(tmp_path / "a", plant, "AUTO")
     try:
         assert within(30, lambda: loop.station.endpoint.sender.lease.held and mode(loop)[0] is Mode.AUTO)
         # Somebody else takes it: the next reading finds that out, and nothing is written any more.
@@ -248,9 +245,8 @@ def test_tending_goes_on_whatever_it_meets() -> None:
     assert said == ["another loop has it", ""]
 
 
-def test_a_station_tends_its_locks_and_its_door(plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(station, "PeriodicTask", lambda act, trouble: PeriodicTask(act, trouble, every_s=0.05))
-    loop = machine(tmp_path / "a", plant, "SHADOW", monkeypatch)
+def test_a_station_tends_its_locks_and_its_door(plant: Plant, tmp_path: Path) -> None:
+    loop = machine(tmp_path / "a", plant, "SHADOW", tended=partial(PeriodicTask, every_s=0.05))
     folder, journal = tmp_path / "a", loop.settings.journal.file
     try:
         locks = [path for path in folder.iterdir() if len(path.name) == 32]
@@ -264,16 +260,13 @@ def test_a_station_tends_its_locks_and_its_door(plant: Plant, tmp_path: Path, mo
         loop.end()
 
 
-def test_a_loop_that_learns_that_another_one_has_its_lock_writes_no_more(
-    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loop_that_learns_that_another_one_has_its_lock_writes_no_more(plant: Plant, tmp_path: Path) -> None:
     gone = Event()
 
     def tending(act: Callable[[], None], trouble: Callable[[str], None]) -> PeriodicTask:
         return PeriodicTask(lambda: act() if gone.is_set() else None, trouble, every_s=0.05)
 
-    monkeypatch.setattr(station, "PeriodicTask", tending)
-    loop = machine(tmp_path / "a", plant, "AUTO", monkeypatch)
+    loop = machine(tmp_path / "a", plant, "AUTO", tended=tending)
     node = loop.settings.nodes.points("mv")["T_j"].node
     try:
         assert within(20, lambda: mode(loop)[0] is Mode.AUTO)
