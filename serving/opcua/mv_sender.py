@@ -70,6 +70,11 @@ class MvSender:
         """Whether the loop has not been told yet where the MV stands."""
         return self.shown_on == 0 or self.told_on != self.shown_on
 
+    @property
+    def doubted(self) -> bool:
+        """Whether the MV before one that waits may not have come, and no reading since has told where it stands."""
+        return self.shown_on == 0
+
     def called(self) -> bool:
         """Note a call to write, and say whether the scan before had one too."""
         now, before, self._called = self.scans, self._called, self.scans
@@ -117,6 +122,10 @@ class MvSender:
             return
         handing = isinstance(last, str)
         barred = nameplates.unwritable or self.barred
+        if not handing and self.doubted:
+            # It was passed on while the one before was on its way, and goes on from where that was to lead.
+            self._failed(self.unwritten or "the MV before this one did not reach the plant")
+            return
         if not handing and barred:  # it may be so since the MV was passed on
             self._failed(barred)
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -32,6 +33,7 @@ class Plant:
         self.endpoint.trouble, self.endpoint.connections = "", 1
         self.mv, self.refuses = 50.0, False
         self.arrived: list[float] = []
+        self.meanwhile: Callable[[], object] = lambda: None  # while a write is on its way
         self.reads()
 
     def reads(self) -> None:
@@ -50,6 +52,8 @@ class Plant:
         asyncio.run(self.endpoint.sender.send(self, plan, self.endpoint.nameplates))  # type: ignore[arg-type]
 
     async def write(self, rows: list[Any], _: float) -> list[int]:
+        meanwhile, self.meanwhile = self.meanwhile, lambda: None
+        meanwhile()
         if self.refuses:
             return [ua.StatusCodes.BadNotWritable]
         if rows != ["owner"]:
@@ -134,6 +138,27 @@ def test_a_read_back_of_before_a_write_that_failed_does_not_tell_where_the_mv_st
     plant.reads()
     assert scan(loop, plant) == ""
     assert plant.arrived == [50.0, 71.0]
+
+
+def test_an_mv_passed_on_while_the_one_before_was_refused_does_not_go_out(loop: ControlLoop, plant: Plant) -> None:
+    """It goes on from where that one was to lead: an actuator would move by both at once."""
+
+    def next_scan() -> None:
+        loop.set_mv([70.0])
+        loop.run(1)
+
+    assert scan(loop, plant) == ""
+    plant.reads()
+    loop.set_mv([60.0])
+    plant.refuses, plant.meanwhile = True, next_scan
+    assert scan(loop, plant) == ""
+    plant.refuses = False
+    plant.sends()
+    assert plant.arrived == [50.0]
+    assert "the server refuses valve" in scan(loop, plant)
+    plant.reads()
+    assert scan(loop, plant) == ""
+    assert plant.arrived == [50.0, 50.0]
 
 
 def test_what_the_loop_is_told_did_not_arrive_does_not_go_out_afterwards(plant: Plant) -> None:

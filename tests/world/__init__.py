@@ -1,1 +1,1 @@
-"""The loop in a world of the tests: every sequence of acts up to a depth, and rules that hold after each scan."""
+"""Loops and stations in worlds of the tests: what may happen is drawn or walked, and rules hold after each scan."""

@@ -1,7 +1,9 @@
-"""Walk the modes of a loop, or play random histories of it, until a rule is broken.
+"""Walk the modes of a loop, or play random histories of loops and stations, until a rule is broken.
 
 ``python -m tests.world --depth 8`` walks every sequence of that many periods; ``--seed N --histories M`` plays random
-ones, and tells one that breaks a rule as short as it gets; ``--planted`` says how soon they find planted bugs.
+ones of a loop, and tells one that breaks a rule as short as it gets. ``--years Y --seed N`` plays stations with their
+connections, journals and leases over so many years of virtual time, each history by its own seed from N on: the seed
+plays it again. ``--planted`` says how soon planted bugs are found.
 """
 
 from __future__ import annotations
@@ -14,7 +16,13 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))  # what all tests share
 
 from world.planted import PLANTED
+from world.planted_stations import PLANTED_STATIONS
+from world.story import drawn, found_in, played, rules, shortened
 from world.walk import starts, walked, wandered
+
+YEAR_S = 365.25 * 86_400.0
+MOST_TRIED = 200  # histories in which a planted bug of a station is sought
+EACH = 25  # histories from one line of progress to the next
 
 
 def main(argv: list[str]) -> int:
@@ -23,6 +31,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--depth", type=int, default=0, help="periods of every sequence")
     parser.add_argument("--seed", type=int, default=0, help="of the random histories (0)")
     parser.add_argument("--histories", type=int, default=0, help="random ones, of twelve periods")
+    parser.add_argument("--years", type=float, default=0.0, help="of virtual time of stations")
     parser.add_argument("--planted", action="store_true", help="find the bugs put in on purpose instead")
     options = parser.parse_args(argv)
     began = time.monotonic()
@@ -32,8 +41,14 @@ def main(argv: list[str]) -> int:
                 rule, path, ran = wandered(options.seed, options.histories or 100_000)
             took = time.monotonic() - began
             print(f"{bug}: {rule or 'NOT FOUND'} after {ran:,} periods, {took:.1f} s in all: {_told(path)}", flush=True)
+        for bug, plant in PLANTED_STATIONS.items():
+            since = time.monotonic()
+            with plant():
+                seed, told = found_in(options.seed, options.histories or MOST_TRIED)
+            rule = rules(told.broken)[0] if told.broken else "NOT FOUND"
+            print(f"{bug}: {rule}, history {seed}, {time.monotonic() - since:.0f} s", flush=True)
         return 0
-    broken = False
+    broken = _years(options.years, options.seed) if options.years else False
     if options.depth:
 
         def tell(depth: int, states: int, periods: int) -> None:
@@ -49,6 +64,31 @@ def main(argv: list[str]) -> int:
         print(f"{ran:,} periods, {time.monotonic() - began:.0f} s: {rule or 'no rule is broken'}: {_told(path)}")
         broken = broken or bool(rule)
     return int(broken)
+
+
+def _years(years: float, seed: int) -> bool:
+    """Play histories of stations, and say of each that breaks a rule what happened in it at least."""
+    began, first, virtual_s, scans, faults, broken = time.monotonic(), seed, 0.0, 0, 0, False
+    while virtual_s < years * YEAR_S:
+        setting, happenings = drawn(seed)
+        try:
+            told = played(setting, happenings)
+        except BaseException:
+            print(f"history {seed} ended by an exception: {setting}", flush=True)
+            raise
+        virtual_s, scans, faults = virtual_s + told.virtual_s, scans + told.scans, faults + told.faults
+        if told.broken:
+            broken, rule = True, rules(told.broken)[0]
+            print(f"history {seed} broke: {'; '.join(told.broken)}\n  {setting}")
+            print(*(f"  {h}" for h in shortened(setting, happenings, rule)), sep="\n", flush=True)
+        seed += 1
+        if (seed - first) % EACH == 0 or virtual_s >= years * YEAR_S:
+            took = time.monotonic() - began
+            print(
+                f"{seed - first} histories, {virtual_s / YEAR_S:.3f} years, {scans:,} scans ({faults:,} with a fault), "
+                f"{took:.0f} s", flush=True,
+            )  # fmt: skip
+    return broken
 
 
 def _told(path: tuple[object, ...]) -> str:

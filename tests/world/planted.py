@@ -18,7 +18,8 @@ from loopwright.serving.mvs.in_hand import ByHand
 Planted = Callable[[], AbstractContextManager[object]]
 
 
-def _in(of: Any, name: str, new: Any) -> Planted:
+def put_in(of: Any, name: str, new: Any) -> Planted:
+    """A bug: ``new`` in the place of a part of a class."""
     return lambda: mock.patch.object(of, name, new)
 
 
@@ -67,14 +68,14 @@ def _set_mode_of_any_shadow(self: ControlLoop, mode: Mode) -> None:
 
 
 PLANTED: dict[str, Planted] = {
-    "a shadow that ends begins where the MV was before it": _in(CommandedMV, "begun", _begun),
-    "good samples before a refused one count towards the end of a fault": _in(LoopMode, "lose", _lose),
-    "a refused sample in AUTO is no fault": _in(LoopMode, "lose", _lose_unseen),
-    "a fault ends one good sample late": _in(LoopMode, "recovers", _recovers_late),
-    "HOLD by a fault creeps": _in(CommandedMV, "fall_back", _fall_back),
-    "a lost write is forgotten without a read-back": _in(AppliedMV, "unread", _unread),
-    "a read-back after a lost write is not looked at": _in(StandingMv, "seen", _seen),
-    "an MV by hand goes at once": _in(ByHand, "sent", _sent_at_once),
-    "a lost write is not noted": _in(AppliedMV, "lose", lambda self: None),
-    "a shadow without a good sample may begin to write": _in(ControlLoop, "set_mode", _set_mode_of_any_shadow),
+    "a shadow that ends begins where the MV was before it": put_in(CommandedMV, "begun", _begun),
+    "good samples before a refused one count towards the end of a fault": put_in(LoopMode, "lose", _lose),
+    "a refused sample in AUTO is no fault": put_in(LoopMode, "lose", _lose_unseen),
+    "a fault ends one good sample late": put_in(LoopMode, "recovers", _recovers_late),
+    "HOLD by a fault creeps": put_in(CommandedMV, "fall_back", _fall_back),
+    "a lost write is forgotten without a read-back": put_in(AppliedMV, "unread", _unread),
+    "a read-back after a lost write is not looked at": put_in(StandingMv, "seen", _seen),
+    "an MV by hand goes at once": put_in(ByHand, "sent", _sent_at_once),
+    "a lost write is not noted": put_in(AppliedMV, "lose", lambda self: None),
+    "a shadow without a good sample may begin to write": put_in(ControlLoop, "set_mode", _set_mode_of_any_shadow),
 }
