@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from loopwright.serving.manifest import Manifest
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.opcua.settings import Nodes, Server
 from loopwright.serving.page.process import Page as PageSettings
-from loopwright.serving.station import station
+from loopwright.serving.station.machine import Machine
 from loopwright.serving.station.settings import Bridge, JournalSettings, Settings
 
 SPEED = 5.0
@@ -79,5 +78,4 @@ def served(controller: Path, folder: Path, **changed: Any) -> RunningLoop:
         page=PageSettings("127.0.0.1:0", token_file=folder / "token"),
         **{"fresh": Bridge(4.0), **changed},
     )
-    with mock.patch.object(station, "OpcUaEndpoint", ModelPlant):
-        return RunningLoop(settings)
+    return RunningLoop(settings, Machine(endpoint=ModelPlant))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from loopwright.serving import Controller, Sample, VirtualClock
-from loopwright.serving.clock import MachineTime
+from loopwright.serving.clock import EndingClock, MachineTime, Time
 from loopwright.serving.opcua.sampling import Values
 from loopwright.serving.opcua.settings import Nodes, Server
 from loopwright.serving.station.machine import Machine
@@ -26,13 +26,13 @@ def settings_of(controller: Controller, **changed: Any) -> Settings:
 class HurriedTime(MachineTime):
     """The machine's, but no scan waits for its period."""
 
-    def paced(self, speed: float) -> VirtualClock:
+    def paced(self, speed: float) -> EndingClock:
         return VirtualClock()
 
 
-def still_machine(folder: Path, endpoint: Any = None) -> Machine:
+def still_machine(folder: Path, endpoint: Any = None, time: Time | None = None) -> Machine:
     """A machine whose plant is ``endpoint``, one that stands still unless given, and whose locks lie in a folder."""
-    return Machine(time=HurriedTime(), endpoint=endpoint or StillPlant, locks=folder / "locks")
+    return Machine(time=time or HurriedTime(), endpoint=endpoint or StillPlant, locks=folder / "locks")
 
 
 class StillPlant:

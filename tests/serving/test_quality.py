@@ -11,17 +11,16 @@ import numpy as np
 import pandas as pd
 import pytest
 from asyncua import ua
+from still_station import still_machine
 
-from loopwright.serving import Controller, EndpointError, Sample, VirtualClock
+from loopwright.serving import Controller, EndpointError, Sample
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.opcua.endpoint import OpcUaEndpoint
 from loopwright.serving.opcua.plan import NodePlan
 from loopwright.serving.opcua.sampling import Ages, NodeSampling, Values
 from loopwright.serving.opcua.settings import Nodes, Server
 from loopwright.serving.opcua.values import NodeReading
-from loopwright.serving.station import station
 from loopwright.serving.station.journal_export import export
-from loopwright.serving.station.mv_lock import Lease
 from loopwright.serving.station.settings import JournalSettings, Settings
 from loopwright.serving.station.station import Station
 from loopwright.serving.station.views import state
@@ -63,12 +62,9 @@ class Between(OpcUaEndpoint):
 
 
 @pytest.fixture
-def running(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Station:
-    monkeypatch.setattr(station, "OpcUaEndpoint", Between)
-    monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
-    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
+def running(tmp_path: Path) -> Station:
     settings = Settings(PID, SERVER, Nodes(**NODES), journal=JournalSettings(tmp_path / "loop.journal"))
-    return Station(settings, controller=Controller(PID))
+    return Station(settings, controller=Controller(PID), machine=still_machine(tmp_path, Between))
 
 
 def test_an_answer_beside_the_scan_gives_its_quality_to_no_other_answers_values(

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 import pytest
 from processes import within as in_time
+from still_station import still_machine
 
-from loopwright.serving import ArtifactError, Controller, Mode, MonotonicClock, Sample, VirtualClock
+from loopwright.serving import ArtifactError, Controller, Mode, MonotonicClock, Sample
+from loopwright.serving.clock import EndingClock, MachineTime, Time
 from loopwright.serving.journal import JournalReader
 from loopwright.serving.loop import Command, within
 from loopwright.serving.opcua.nameplates import Identity
@@ -62,13 +64,16 @@ class Plant:
         self.written.append(float(mv[0]))
 
 
-@pytest.fixture
-def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[Station, Any]]:
-    monkeypatch.setattr(station, "OpcUaEndpoint", Plant)
-    monkeypatch.setattr(station, "MonotonicClock", lambda _: VirtualClock())
-    monkeypatch.setattr(station, "Lease", lambda endpoint, nodes: Lease(endpoint, nodes, tmp_path / "locks"))
+class SlowTime(MachineTime):
+    """The machine's; scans wait for a period of half a second for 500."""
 
-    def make(start: str, **changed: Any) -> tuple[Station, Any]:
+    def paced(self, speed: float) -> EndingClock:
+        return MonotonicClock(1e-3)
+
+
+@pytest.fixture
+def make_station(tmp_path: Path) -> Callable[..., tuple[Station, Any]]:
+    def make(start: str, time: Time | None = None, **changed: Any) -> tuple[Station, Any]:
         server = Server("opc.tcp://127.0.0.1:1", security="None", insecure=True, connect_s=0.05)
         settings = Settings(
             changed.pop("controller", PID),
@@ -79,7 +84,8 @@ def make_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..
             journal=JournalSettings(tmp_path / "loop.journal"),
             **changed,
         )
-        made = Station(settings, controller=Controller(settings.controller))
+        machine = still_machine(tmp_path, Plant, time)
+        made = Station(settings, controller=Controller(settings.controller), machine=machine)
         return made, made.endpoint
 
     return make
@@ -121,10 +127,9 @@ def test_a_loop_that_is_ended_while_it_waits_for_a_pv_writes_nothing(
 
 
 def test_a_loop_that_is_ended_between_two_scans_does_not_wait_for_the_next(
-    make_station: Callable[..., tuple[Station, Any]], monkeypatch: pytest.MonkeyPatch
+    make_station: Callable[..., tuple[Station, Any]],
 ) -> None:
-    monkeypatch.setattr(station, "MonotonicClock", lambda _: MonotonicClock(1e-3))  # half a second in 500
-    made, plant = make_station("AUTO")
+    made, plant = make_station("AUTO", SlowTime())
     thread = threading.Thread(target=made.run)
     thread.start()
     assert in_time(20, lambda: made.snapshot is not None)

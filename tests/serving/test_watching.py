@@ -14,6 +14,7 @@ import pytest
 from processes import within
 
 from loopwright.serving import Command, Controller, Mode
+from loopwright.serving.clock import MACHINE_TIME
 from loopwright.serving.journal import Journal, JournalReader
 from loopwright.serving.monitor import Monitor, Verdict
 from loopwright.serving.monitor.weekly import WeeklyCounts
@@ -110,7 +111,7 @@ def station_that(did: list[str], write: Callable[..., object]) -> Station:
             courses=SimpleNamespace(ends={}, finished=(), now_s=0.0, standing={}),
         ),
         _steered=Steered(), _courses=LastCourses(), settings=SimpleNamespace(speed=1.0),
-        journal=SimpleNamespace(keep=lambda *_: None),
+        journal=SimpleNamespace(keep=lambda *_: None), time=MACHINE_TIME,
         _moved=lambda loop: None,
         scans=0, _faults=0, _missed_periods=0, _watchers=[lambda *_: did.append("others")], snapshot=None,
         recorder=SimpleNamespace(controller=controller, scan=write),
@@ -145,7 +146,7 @@ def test_an_alarm_is_written_down_within_one_look_whatever_the_clock_does(
 ) -> None:
     notes, kept = list[str](), list[str]()
     journal = SimpleNamespace(path=tmp_path / "none.journal", keep=lambda name, text: kept.append(name))
-    recorder = SimpleNamespace(journal=journal, note=lambda *words, **_: notes.append(words[2]))
+    recorder = SimpleNamespace(journal=journal, time=MACHINE_TIME, note=lambda *words, **_: notes.append(words[2]))
     controller = Controller(FILE)
     m = controller.manifest
     watching = MonitorRunner(controller, cast(Recorder, recorder))

@@ -263,10 +263,8 @@ def ran(recorder: Recorder, controller: Controller, scans: int, began_s: float) 
     return watching
 
 
-def test_a_loop_that_was_killed_goes_on_with_the_counts_of_its_week(
-    recorder: Recorder, operated: Controller, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("loopwright.serving.station.recorder.time", SimpleNamespace(time=lambda: MONDAY_S + 100))
+def test_a_loop_that_was_killed_goes_on_with_the_counts_of_its_week(recorder: Recorder, operated: Controller) -> None:
+    recorder.time = SimpleNamespace(wall_s=lambda: MONDAY_S + 100)  # type: ignore[assignment]
     assert operated.manifest.period_s == 1.0
     ran(recorder, operated, 90, MONDAY_S)  # written once a minute: 30 scans are lost
     again = ran(recorder, operated, 10, MONDAY_S + 100)
@@ -279,10 +277,8 @@ def test_a_loop_that_was_killed_goes_on_with_the_counts_of_its_week(
         assert reader.learnt_names(WEEK) == ["week 2023-11-20"]
 
 
-def test_a_week_that_somebody_forged_is_told_and_counted_anew(
-    recorder: Recorder, operated: Controller, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("loopwright.serving.station.recorder.time", SimpleNamespace(time=lambda: MONDAY_S))
+def test_a_week_that_somebody_forged_is_told_and_counted_anew(recorder: Recorder, operated: Controller) -> None:
+    recorder.time = SimpleNamespace(wall_s=lambda: MONDAY_S)  # type: ignore[assignment]
     recorder.journal.keep("week 2023-11-20", '{"AUTO": -5}')
     assert within(10, lambda: recorder.journal.behind == 0)
     assert ran(recorder, operated, 3, MONDAY_S).weekly.counts["AUTO"] == 3

@@ -7,7 +7,7 @@ import math
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,7 +17,7 @@ from loopwright.serving.manifest import Manifest
 from world.virtual_time import VirtualTime
 
 SPACE, OTHER = "urn:plant", "urn:somebody"
-LEASE, HEARTBEAT = f"nsu={SPACE};s=lease", f"nsu={SPACE};s=heartbeat"
+LEASE, HEARTBEAT, WATCHDOG = (f"nsu={SPACE};s={name}" for name in ("lease", "heartbeat", "watchdog"))
 GOOD, BAD = ua.StatusCodes.Good, ua.StatusCodes.BadSensorFailure
 USUAL_S, SLOWEST_S = (0.002, 0.05), 5.0  # one way of a message
 TIME_CONSTANT = 12.0  # periods of the loop
@@ -34,6 +34,8 @@ class Item:
     kind: ua.VariantType = DOUBLE
     status: int = GOOD
     writable: bool = False
+    stands_s: float | None = None  # since when it and its source time stand still
+    shown: Any = None  # in the place of its value
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,9 @@ class PlantServer:
     spaces: list[str] = field(default_factory=lambda: ["http://opcfoundation.org/UA/", "urn:server", SPACE])
     written: list[Written] = field(default_factory=list)
     refuses: bool = False  # to write MVs
+    deleted: set[str] = field(default_factory=set)  # nodes that are not there now
     stamp_by_s: float = 0.0  # its clock beside the world's
+    takes_s: tuple[float, float] = USUAL_S  # one way of a message, at least and at most
     answered_s: dict[str, float] = field(default_factory=dict)  # when each machine was last told all values
     had_lease_s: dict[str, float] = field(default_factory=dict)  # when each owner's name last stood in the lease
 
@@ -77,6 +81,7 @@ class PlantServer:
         m, self.started_s = self.manifest, self.time.wall_s()
         self.items: dict[str, Item] = {"lease": Item("", ua.VariantType.String, writable=True)}
         self.items["heartbeat"] = Item(0, ua.VariantType.Int32, writable=True)
+        self.items["watchdog"] = Item(0, ua.VariantType.Int32)
         for s in (*m.pv, *m.dv):
             self.items[s.name] = Item(s.middle)
         for s in m.mv:
@@ -108,9 +113,13 @@ class PlantServer:
         if share <= 0:
             return
         self._moved_s = now
+        if self.items["watchdog"].stands_s is None:
+            self.items["watchdog"].value = int(now / m.period_s)
         pull = sum((self.mv[s.name] - s.middle) / (s.high - s.low) for s in m.mv) / len(m.mv)
         for s in m.pv:
             item, span = self.items[s.name], s.high - s.low
+            if item.stands_s is not None:
+                continue
             if isinstance(item.value, float) and math.isfinite(item.value) and s.low <= item.value <= s.high:
                 item.value += share * (s.middle + PULL * span * pull - item.value)
                 item.value += NOISE * span * self.rng.uniform(-1, 1)
@@ -131,8 +140,10 @@ class PlantServer:
             return _answer(ua.NodeId(ua.ObjectIds.Double), stamp)
         if attribute != ua.AttributeIds.Value:
             return ua.DataValue(StatusCode=ua.StatusCode(ua.StatusCodes.BadAttributeIdInvalid))
-        value = round(item.value) if item.kind is ua.VariantType.Int32 else item.value
-        return ua.DataValue(ua.Variant(value, item.kind), ua.StatusCode(item.status), SourceTimestamp=stamp)
+        if item.stands_s is not None:
+            stamp -= timedelta(seconds=self.time.now_s - item.stands_s)
+        variant = ua.Variant(item.value, item.kind) if item.shown is None else ua.Variant(item.shown)
+        return ua.DataValue(variant, ua.StatusCode(item.status), SourceTimestamp=stamp)
 
     def write(self, node: ua.NodeId, value: ua.Variant) -> int:
         """The status of a write of one node."""
@@ -150,6 +161,8 @@ class PlantServer:
 
     def _item(self, node: ua.NodeId) -> Item | None:
         at = int(node.NamespaceIndex)
+        if node.Identifier in self.deleted:
+            return None
         return self.items.get(str(node.Identifier)) if at < len(self.spaces) and self.spaces[at] == SPACE else None
 
     def _of_server(self, identifier: Any) -> Any:
@@ -218,7 +231,7 @@ class Wire:
     def _takes_s(self) -> float:
         rng, net = self.server.rng, self.server.network
         slow = self.server.time.now_s < net.slow_until_s
-        return rng.uniform(0.0, SLOWEST_S) if slow else rng.uniform(*USUAL_S)
+        return rng.uniform(0.0, SLOWEST_S) if slow else rng.uniform(*self.server.takes_s)
 
 
 class PlantClient:

@@ -22,7 +22,7 @@ from loopwright.serving.station.settings import Hold, JournalSettings, Settings
 from loopwright.serving.station.station import Station
 from loopwright.serving.trust import Controller
 from loopwright.serving.words import first_line
-from world.plant_server import HEARTBEAT, LEASE, SPACE, PlantClient, PlantServer
+from world.plant_server import HEARTBEAT, LEASE, SPACE, WATCHDOG, PlantClient, PlantServer
 from world.virtual_time import VirtualTime
 
 RECOVER_AFTER = 3  # good samples that end a fault
@@ -126,6 +126,7 @@ class Side:
     numbered: bool = False  # nodes by the number of their namespace
     heartbeat: bool = True
     rewrite_s: float = 0.0
+    watchdog: bool = False
     station: Station = field(init=False)
     scans: list[ScanSeen] = field(default_factory=list)  # taken away by whoever judges them
     told: list[str] = field(default_factory=list)
@@ -141,7 +142,14 @@ class Side:
         def ids(signals: Any) -> dict[str, str]:
             return {s.name: f"ns=2;s={s.name}" if self.numbered else f"nsu={SPACE};s={s.name}" for s in signals}
 
-        nodes = Nodes(ids(m.pv), ids(m.mv), dv=ids(m.dv), lease=LEASE, heartbeat=HEARTBEAT if self.heartbeat else "")
+        nodes = Nodes(
+            ids(m.pv),
+            ids(m.mv),
+            dv=ids(m.dv),
+            lease=LEASE,
+            heartbeat=HEARTBEAT if self.heartbeat else "",
+            watchdog=WATCHDOG if self.watchdog else "",
+        )
         server = Server("opc.tcp://plant:4840", security="None", insecure=True, rewrite_s=self.rewrite_s)
         return Settings(
             self.controller.path, server, nodes, start=self.start, accept_unproven=True,
