@@ -20,6 +20,7 @@ from manual.errors import errors
 from manual.floors import contracts, floors
 from manual.laws import choice, facts, info_names, results
 from manual.markdown import code, prose, table
+from manual.modes import modes
 from manual.parameters import parameters, whole
 from manual.thresholds import thresholds
 
@@ -101,6 +102,7 @@ GENERATED: dict[str, Callable[..., str]] = {
     "manifest": lambda: _file(Manifest),
     "metrics": _metrics,
     "models": _models,
+    "modes": modes,
     "params": _params,
     "results": results,
     "thresholds": thresholds,
