@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -38,7 +38,8 @@ class OperatingRange:
     integrator) takes set points drawn over its own visited range, under MVs that balance it; and so do all CVs where
     even the medians' rest leaves the visited range. No set point leaves it: one that no MV was found for is cut to it.
 
-    ``ranges``, PV -> (lowest, highest), are to be kept beside the set points: no rest beyond one of them is drawn.
+    ``ranges``, PV -> (lowest, highest), are to be kept beside the set points: no rest beyond one of them is drawn, but
+    where none within is found at all.
     """
 
     model: IdentifiedPlant
@@ -132,18 +133,24 @@ class OperatingRange:
 
     def drawn(self, plant: Simulator, seed: int, p: Array | None = None) -> tuple[Array, bool]:
         """(``set_points``, whether the plant rests at each: else where it starts stands in for one)."""
+        levels, found = self._levels(plant, seed, p)
+        if self.ranges and not found.any():
+            levels, _ = replace(self, ranges={})._levels(plant, seed, p)
+        return np.repeat(np.clip(levels, self.cv[0], self.cv[2]), self.hold, axis=0), bool(found.all())
+
+    def _levels(self, plant: Simulator, seed: int, p: Array | None) -> tuple[Array, NDArray[np.bool_]]:
+        """CVs (TEST_LEVELS, n_cv), and at which of them (TEST_LEVELS,) the plant rests."""
         rng = np.random.default_rng(seed)
         draws = rng.uniform(self.mv[0], self.mv[2], (TEST_LEVELS, self.mv.shape[1]))
         if self.integrates:
-            levels, rests = self._balances(plant, draws, rng, p)
-        else:
-            levels, good = self._rests(plant, draws, p)
-            wanted, rests = rng.uniform(self.cv[0], self.cv[2], levels.shape), True
-            for k in np.flatnonzero(~good):
-                held = self._held(plant, wanted[k], p)
-                rests &= held is not None
-                levels[k] = self._begin(plant) if held is None else held
-        return np.repeat(np.clip(levels, self.cv[0], self.cv[2]), self.hold, axis=0), rests
+            return self._balances(plant, draws, rng, p)
+        levels, good = self._rests(plant, draws, p)
+        wanted = rng.uniform(self.cv[0], self.cv[2], levels.shape)
+        for k in np.flatnonzero(~good):
+            held = self._held(plant, wanted[k], p)
+            good[k] = held is not None
+            levels[k] = self._begin(plant) if held is None else held
+        return levels, good
 
     def stays(self, plant: IdentifiedPlant, p: Array) -> bool:
         """Whether a plant with the parameters p (n_p,) stays where it answers to, under each MV at its ends.
@@ -199,11 +206,11 @@ class OperatingRange:
 
     def _balances(
         self, plant: Simulator, draws: Array, rng: np.random.Generator, p: Array | None
-    ) -> tuple[Array, bool]:
-        """CVs (TEST_LEVELS, n_cv) of rests, with levels drawn for those that integrate; and whether all are rests."""
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """CVs (TEST_LEVELS, n_cv) of rests, with levels drawn for those that integrate; and which of them are rests."""
         which, (start, mv0) = list(self.integrates), plant.start
         wanted = rng.uniform(self.cv[0, which], self.cv[2, which], (len(draws), len(which)))
-        found, rests = np.tile(plant.measure(start)[: self.cv.shape[1]], (len(draws), 1)), True
+        found, rests = np.tile(plant.measure(start)[: self.cv.shape[1]], (len(draws), 1)), np.ones(len(draws), bool)
         for k, (draw, levels) in enumerate(zip(draws, wanted, strict=True)):
             found[k, which] = levels
             for scale in SCALES:
@@ -215,7 +222,7 @@ class OperatingRange:
                     found[k] = cvs
                     break
             else:
-                rests = False
+                rests[k] = False
         return found, rests
 
 

@@ -101,10 +101,10 @@ def sign_held(name: str, params: PlantParams) -> dict[str, int]:
 
 
 def kept_ranges(name: str, params: PlantParams) -> dict[str, tuple[float, float]]:
-    """PV -> the range that some law of the plant keeps from its start, by its ``operate`` in params.yaml.
+    """PV -> the range that the laws of the plant keep from their start, by their ``operate`` in params.yaml.
 
     A set point that asks for a rest beyond it would have to be missed, by the bound's control as well. An entry that is
-    no number is left to the law's design, which says so.
+    no number is left to the law's design, which says so; a PV for which two laws have ranges apart has none here.
     """
     found = {s.name: (-math.inf, math.inf) for s in params.pv}
     for key in sections_of("controllers", name):
@@ -115,4 +115,4 @@ def kept_ranges(name: str, params: PlantParams) -> dict[str, tuple[float, float]
         for pv, (low, high) in found.items():
             if given.get(f"{pv}.use", 1):
                 found[pv] = max(low, given.get(f"{pv}.low", low)), min(high, given.get(f"{pv}.high", high))
-    return {pv: ends for pv, ends in found.items() if ends != (-math.inf, math.inf)}
+    return {pv: ends for pv, ends in found.items() if ends != (-math.inf, math.inf) and ends[0] < ends[1]}

@@ -159,7 +159,13 @@ class OwnCase(OwnEnsemble):
     @cached_property
     def _held_out(self) -> tuple[Scenario, ...]:
         title = "Set points, on models identified from the record"
-        return tuple(self._test("held_out", title, self.reach.set_points(p, s), p, s, {}) for s, p in self._pairs)
+        drawn = zip(self._pairs, self._drawn, strict=True)
+        return tuple(self._test("held_out", title, sp, p, s, {}) for (s, p), (sp, _) in drawn)
+
+    @cached_property
+    def _drawn(self) -> list[tuple[Array, bool]]:
+        """Set points of each pair, and whether its plant rests at all of them, within the ranges that laws keep."""
+        return [self.reach.drawn(p, s) for s, p in self._pairs]
 
     @cached_property
     def _scenarios(self) -> dict[str, tuple[Scenario, ...]]:
@@ -267,6 +273,11 @@ class OwnCase(OwnEnsemble):
             found.append(f"There is no test with loads: {why}. Its weight goes to the other tests.")
         elif left < wanted:
             found.append(f"{wanted - left} of {wanted} tests with loads are left out: {why}.")
+        if self.kept_ranges and not all(rests for _, rests in self._drawn):
+            found.append(
+                f"Some set points are those at which a plant stands already, or ask for rests beyond the ranges of "
+                f"{', '.join(self.kept_ranges)}: no other rest within these was found."
+            )
         if DAILY not in tests and self.set_points is not None:
             found.append(
                 f"There is no test of daily work: it replays {max(LEAST_DAILY_ROWS, self.hold)} rows or more in one "

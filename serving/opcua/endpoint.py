@@ -191,7 +191,8 @@ class OpcUaEndpoint:
         """Pass an MV (n_mv,) on; EndpointError where the last one did not arrive, or there is no connection.
 
         A connection that was made anew takes none before ``read`` has told where the MV stands, and so does one on
-        which a write has failed. An MV that still waits for a slow answer is not lost: this one goes out in its place.
+        which a write has failed. An MV that still waits for a slow answer is not lost: this one goes out in its
+        place, unless that answer is a refusal; then the next call says so.
         """
         sender = self.sender
         mine = sender.called()

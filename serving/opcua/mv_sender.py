@@ -72,7 +72,7 @@ class MvSender:
 
     @property
     def doubted(self) -> bool:
-        """Whether the MV before one that waits may not have come, and no reading since has told where it stands."""
+        """Whether what was sent last may not have come, and no reading since has told where the MVs stand."""
         return self.shown_on == 0
 
     def called(self) -> bool:
@@ -123,8 +123,9 @@ class MvSender:
         handing = isinstance(last, str)
         barred = nameplates.unwritable or self.barred
         if not handing and self.doubted:
-            # It was passed on while the one before was on its way, and goes on from where that was to lead.
-            self._failed(self.unwritten or "the MV before this one did not reach the plant")
+            # It was passed on while another one was on its way, and goes on from where that was to lead; behind a
+            # request to hand the plant back that was refused, it waits for a reading, too.
+            self._failed(self.unwritten or "where the MV stands has not been read yet")
             return
         if not handing and barred:  # it may be so since the MV was passed on
             self._failed(barred)

@@ -100,6 +100,7 @@ class Station:
             tell=self._connection,
             spaces=namespaces_before(settings.journal.file, settings.server.endpoint),
             identified=self._identified,
+            clock=self.time.steady_s,
         )
         points = settings.nodes.points("mv").values()
         self.lease = Lease(settings.server.endpoint, [p.node for p in points], machine.locks)

@@ -87,6 +87,24 @@ def test_a_range_of_the_controlled_variable_itself_counts() -> None:
     assert found.min() < -0.5
 
 
+@pytest.mark.parametrize("operate", [{"y1.low": 2.5}, {"y1.high": -2.5}])
+def test_ranges_within_which_nothing_rests_leave_set_points_as_they_were_and_it_is_told(
+    operate: dict[str, float],
+) -> None:
+    free, kept = constrained({}), constrained(operate)
+    assert len(kept.lacking) == len(free.lacking) + 1
+    for one, other in zip(kept.scenarios()["held_out"], free.scenarios()["held_out"], strict=True):
+        assert np.array_equal(one.sp, other.sp)
+
+
+def test_ranges_of_two_laws_that_lie_apart_are_none() -> None:
+    constrained({"y1.high": 0.2})
+    tree = yaml.safe_load(Path("params.yaml").read_text())
+    tree["controllers"]["it-other"] = {**tree["controllers"]["it-predictive"], "operate": {"y1.low": 0.5}}
+    Path("params.yaml").write_text(yaml.safe_dump(tree))
+    assert own_case("it").kept_ranges == {}
+
+
 @pytest.mark.parametrize(("operate", "rests"), [({}, True), ({"y1.high": 0.4}, True), ({"y1.low": 0.95}, False)])
 def test_levels_that_never_settle_are_balanced_within_the_range(operate: dict[str, float], rests: bool) -> None:
     """The level rests where both MVs are equal, and y1 where they are: at .95 only beyond what was drawn."""

@@ -1,6 +1,6 @@
 """A loop on a real OPC UA server, and what goes wrong between them that only a real one shows.
 
-``test_world_faults.py`` has all of it, in a world of its own time. With ``-s`` each fault is printed with the
+``test_world_faults.py`` has the others, in a world of its own time. With ``-s`` each fault is printed with the
 periods that it took until HOLD and, once it was over, until AUTO.
 """
 

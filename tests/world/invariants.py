@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from loopwright.serving import Mode
+from loopwright.serving.opcua.endpoint import ANSWER_PART, LONGEST_OPC_ANSWER_S
 from loopwright.serving.station.settings import MAX_AGE, TRANSFER
 from world.plant_server import SLOWEST_S, PlantServer, Written
 from world.stations import ScanSeen, Side
 
-LATE_S = 4 * SLOWEST_S + 1.0  # after a scan, a write that it sent has come: the lease is taken first
 MOST_WAITING = 8  # MVs that wait for a connection
 AFTER_TAKING = 2  # periods in which a loop that has lost the lease finds that out
 TURN = 3  # periods in which no loop writes, another one, and the first again
@@ -26,7 +26,7 @@ class _Of:
 
     last: ScanSeen | None = None
     held: np.ndarray | None = None  # what HOLD has written
-    wrote_s: float = -np.inf  # the last scan that wrote
+    commands: deque[tuple[float, np.ndarray | None]] = field(default_factory=lambda: deque(maxlen=400))  # by scan
     lives: int = 0
 
 
@@ -49,6 +49,8 @@ class Judge:
         m = self.server.manifest
         self._low, self._high = (np.array([getattr(s, end) for s in m.mv]) for end in ("low", "high"))
         self._period_s = m.period_s
+        # After a scan, a write that it sent has come: the lease is taken first, by two requests.
+        self._late_s = 3 * min(ANSWER_PART * m.period_s, LONGEST_OPC_ANSWER_S) + SLOWEST_S + 1.0
 
     def digest(self) -> int:
         """A number of all that was written and when: equal histories have the same."""
@@ -79,14 +81,12 @@ class Judge:
         if of.lives != side.lives:
             of.last, of.held, of.lives = None, None, side.lives
         time_s, mv = seen.time_s, np.asarray(command.mv)
+        of.commands.append((time_s, mv if command.writes else None))
         if not command.writes:
             of.held = None
         else:
             if not np.all(np.isfinite(mv)) or np.any(mv < self._low) or np.any(mv > self._high):
                 self.breaks(time_s, "a commanded MV lies within its range")
-            if command.mode is Mode.SHADOW:
-                self.breaks(time_s, "nothing is written in SHADOW")
-            of.wrote_s = time_s
             if command.mode is Mode.HOLD:
                 if of.held is not None and not seen.asked and not np.array_equal(of.held, mv):
                     self.breaks(time_s, "HOLD holds")
@@ -122,11 +122,14 @@ class Judge:
         if first.by == one.by != other.by and again.time_s - first.time_s <= TURN * self._period_s:
             self.breaks(time_s, "two loops do not write in turns")
         side = next(side for side in self.sides if side.name == one.by)
-        if time_s - self._of[side.name].wrote_s > LATE_S and not side.scans:
-            self.breaks(time_s, "what comes to the server was commanded just now")
+        recent = [mv for at, mv in self._of[side.name].commands if time_s - self._late_s <= at <= time_s]
+        value = np.array([one.mv.get(s.name, np.nan) for s in m.mv])
+        room = ROUNDING * (self._high - self._low)
+        if not any(mv is not None and np.all(np.abs(mv - value) <= room) for mv in recent):
+            self.breaks(time_s, "what comes to the server was commanded just now, and nothing in SHADOW")
         self._owners |= {other.station.endpoint.sender.lease.owner: other.name for other in self.sides}
         had_s = [s for owner, s in one.lost_s.items() if self._owners.get(owner) == one.by]
-        just_lost = time_s - max(had_s, default=-np.inf) <= AFTER_TAKING * self._period_s + LATE_S
+        just_lost = time_s - max(had_s, default=-np.inf) <= AFTER_TAKING * self._period_s + self._late_s
         if self._owners.get(one.owner) != one.by and not just_lost:
             self.breaks(time_s, "who writes has the lease, or lost it just now")
 
@@ -156,11 +159,9 @@ class Judge:
             if side.alive:
                 self.breaks(now, "a loop that is ended ends")
                 continue
-            rows, lost = side.rows(), side.unwritten
-            if not side.scanned - lost <= rows <= side.scanned:
-                self.breaks(
-                    now, f"each scan is in the journal, or counted as lost ({rows} of {side.scanned}, lost {lost})"
-                )
+            rows, lost, scans = side.rows(), side.unwritten, side.scanned - side.before
+            if not scans - lost <= rows <= scans:
+                self.breaks(now, f"each scan is in the journal, or counted as lost ({rows} of {scans}, lost {lost})")
             noted = Counter(e.what for e in side.events() if e.who == "anna")
             missing = Counter(side.asked) - noted
             if missing.total() > lost:

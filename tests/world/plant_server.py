@@ -120,11 +120,8 @@ class PlantServer:
             item, span = self.items[s.name], s.high - s.low
             if item.stands_s is not None:
                 continue
-            if isinstance(item.value, float) and math.isfinite(item.value) and s.low <= item.value <= s.high:
-                item.value += share * (s.middle + PULL * span * pull - item.value)
-                item.value += NOISE * span * self.rng.uniform(-1, 1)
-            else:  # a sensor that was broken
-                item.value = s.middle + PULL * span * pull
+            item.value += share * (s.middle + PULL * span * pull - item.value)
+            item.value += NOISE * span * self.rng.uniform(-1, 1)
             item.value = min(max(item.value, s.low), s.high)
 
     # ------------------------------------------------------------------------------------------------------ requests

@@ -36,6 +36,16 @@ def _scan_of_good(scan: Any) -> Any:
     return act
 
 
+def _late(stands: Any) -> Any:
+    def act(self: MvSender, mv: Any, mine: bool) -> Any:
+        held = self.__dict__.setdefault("held", [])
+        held.append(mv.copy())
+        mv[:] = held[max(0, len(held) - 11)]
+        return stands(self, mv, mine)
+
+    return act
+
+
 def _give_back(self: EntryQueue, most: int) -> None:
     self._taken = []
 
@@ -63,5 +73,6 @@ PLANTED_STATIONS: dict[str, Planted] = {
     "what the disk does not take is forgotten": put_in(EntryQueue, "give_back", _give_back),
     "a connection is made anew after hours": put_in(OpcUaEndpoint, "_rest", _rests_on),
     "values of long ago are as young as any": put_in(OpcUaEndpoint, "read", _young(OpcUaEndpoint.read)),
+    "an MV goes out ten scans late": put_in(MvSender, "stands", _late(MvSender.stands)),
     "no scan is written down while a fault lasts": put_in(Journal, "scan", _scan_of_good(Journal.scan)),
 }

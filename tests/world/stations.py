@@ -52,6 +52,9 @@ class SteppedJournal(Journal):
         self._due = False
         if self.dead:
             return
+        if self.stuck_until_s > self.world.now_s:
+            self._schedule()
+            return
         self._turn()
         if len(self._queue):
             self._schedule()
@@ -71,6 +74,7 @@ class WorldEndpoint(OpcUaEndpoint):
 
     def start(self) -> None:
         self.task = self.world.loop.create_task(self._keep_connected())
+        self.task.add_done_callback(self.world.task_ended)
 
     def write(self, mv: Any) -> None:
         try:
@@ -134,6 +138,7 @@ class Side:
     lives: int = 0
     alive: bool = False
     scanned: int = 0  # of all lives
+    before: int = 0  # of those, in a journal that was lost as a whole
     unwritten: int = 0  # scans and events that a death or the disk may have taken
 
     def settings(self) -> Settings:
@@ -178,7 +183,7 @@ class Side:
         async def connect(server: Server, period_s: float) -> Link:
             return await Link.opened(server, period_s, lambda *_, **__: PlantClient(self.server, self.name))
 
-        return lambda *given, **named: kind(*given, connect=connect, clock=self.world.steady_s, **named)
+        return lambda *given, **named: kind(*given, connect=connect, **named)
 
     def _tended(self, act: Callable[[], object], trouble: Callable[[str], None]) -> Any:
         of = self.lives
@@ -238,9 +243,10 @@ class Side:
         station, self.alive = self.station, False
         journal: Any = station.journal
         journal.dead = True
-        self.unwritten += len(journal._queue)
+        self.unwritten += len(journal._queue) + journal.lost
         if not self.journal.exists():
-            self.unwritten += self.scanned  # taken away in the moment before
+            self.forget()  # taken away in the moment before
+        station.printer.end()
         with suppress(sqlite3.Error):
             journal._base.close()
         os.close(journal._lock)
@@ -252,6 +258,11 @@ class Side:
         if endpoint._link is not None:
             endpoint._link.abort()
         self._leave()
+
+    def forget(self) -> None:
+        """All that was written down is gone with the journal, which nobody had open who could make it again."""
+        self.before, self.unwritten = self.scanned, 0
+        self.asked.clear()
 
     def events(self) -> list[Any]:
         """All events of the journal."""

@@ -134,9 +134,8 @@ def _sensor(world: World, side: Side, h: Happening) -> None:
         item.status = BAD
         world.ends(h, lambda: setattr(item, "status", GOOD))
     else:
-        good = item.value
-        item.value = float("nan") if h.number < 0.4 else s.high + (s.high - s.low)
-        world.ends(h, lambda: setattr(item, "value", good))
+        item.shown = float("nan") if h.number < 0.4 else s.high + (s.high - s.low)
+        world.ends(h, lambda: setattr(item, "shown", None))
 
 
 def _others_move(world: World, side: Side, h: Happening) -> None:
@@ -206,7 +205,7 @@ def _deleted(world: World, side: Side, h: Happening) -> None:
     """Somebody takes the journal away."""
     side.journal.unlink(missing_ok=True)
     if not side.alive:
-        side.unwritten += side.scanned  # nobody has the file open, who could make it again
+        side.forget()
 
 
 def _dies(world: World, side: Side, h: Happening) -> None:
@@ -283,8 +282,8 @@ def played(setting: Setting, happenings: Sequence[Happening]) -> Told:
     """Play a history to its end, and a quiet time after it in which all must come right."""
     base = Path("/dev/shm") if Path("/dev/shm").is_dir() else None
     folder = Path(tempfile.mkdtemp(prefix="loopwright-world-", dir=base))
+    world = World(setting, folder)
     try:
-        world = World(setting, folder)
         for side in world.sides:
             side.begin()
         for h in happenings:
@@ -301,11 +300,18 @@ def played(setting: Setting, happenings: Sequence[Happening]) -> Told:
         world.time.pass_until(world.time.now_s + 10 * world.period_s + 60.0)
         world.judge.at_end()
         judge = world.judge
-        told = Told(tuple(judge.broken), judge.scans, world.time.now_s, judge.wrote, judge.faults, judge.digest())
-        world.time.close()
+        return Told(tuple(judge.broken), judge.scans, world.time.now_s, judge.wrote, judge.faults, judge.digest())
     finally:
+        world.time.close()
         shutil.rmtree(folder, ignore_errors=True)
-    return told
+
+
+def played_from(seed: int) -> Told:
+    """The history of a seed, in a worker; what ends it by an exception counts as a broken rule."""
+    try:
+        return played(*drawn(seed))
+    except Exception as error:
+        return Told((f"0 s: a history comes to its end ({type(error).__name__}: {error})",), 0, 0.0, 0, 0, 0)
 
 
 def rules(broken: Sequence[str]) -> list[str]:

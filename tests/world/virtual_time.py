@@ -84,6 +84,11 @@ class VirtualTime:
         """What a call of the event loop raises ends the world."""
         self._failed.append(context.get("exception") or HangsError(context["message"]))
 
+    def task_ended(self, task: asyncio.Task[Any]) -> None:
+        """Called at the end of a task: what it raised ends the world."""
+        if not task.cancelled() and (error := task.exception()) is not None:
+            self._failed.append(error)
+
     # -------------------------------------------------------------------------------------- as a loop's machine has it
     def wall_s(self) -> float:
         return BEGIN_S + self.set_by_s + self.now_s
